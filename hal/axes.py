@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.channels import AxesChannels
+from thermoctl.rig.channels import AxesChannels
 from thermoctl_hal.backend import Sample
 from thermoctl_hal.devices import DevicesBackend
 

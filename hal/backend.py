@@ -20,7 +20,7 @@ fault injector can wrap any of them. thermoctl_hal.make creates them.
   `time.monotonic()`). The simulated and replayed back ends take any clock, so they can run faster than real
   time.
 
-A sample has arrays over the rig's channels (thermoctl/channels.py), in their order:
+A sample has arrays over the rig's channels (thermoctl/rig/channels.py), in their order:
 
     value    float64, in the role's unit; the last valid reading, NaN before the first one
     time_s   float64, when that reading was taken (clock of `now_s`); -inf before the first one
@@ -52,7 +52,7 @@ from typing import Protocol
 
 import numpy as np
 
-from thermoctl import channels
+from thermoctl.rig import channels
 
 ROLES, ROLE = channels.CHANNELS, channels.INDEX
 """Roles of the paper's actuator only, and their indices: a rig's own are `settings.channels`."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from thermoctl.channels import DEFAULT, AxesChannels, Channels
+from thermoctl.rig.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.profile import BinaryFrame, Channel, Cia402, Profile, Register, TextLine
 from thermoctl_hal.read_ethercat import LONGEST_WATCHDOG_S, Ethercat

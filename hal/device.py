@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoctl.channels import AxesChannels
+from thermoctl.rig.channels import AxesChannels
 from thermoctl_hal.backend import ERROR, STALE, Sample
 from thermoctl_hal.binding import Binding
 from thermoctl_hal.wire import Channels

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from thermoctl.channels import AT, DEFAULT, AxesChannels, Channels
+from thermoctl.rig.channels import AT, DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import ABSENT, STALE, HardwareError, Sample
 from thermoctl_hal.board import Board

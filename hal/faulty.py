@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import AT, DEFAULT, Channels
+from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import Node, Section, suggest
 from thermoctl_hal.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thermoctl.channels import AxesChannels
-from thermoctl.settings import Settings
+from thermoctl.configuration.settings import Settings
+from thermoctl.rig.channels import AxesChannels
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.axes import AxisBackend
 from thermoctl_hal.backend import Backend, HardwareError

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import DEFAULT, Channels
+from thermoctl.configuration.settings import Settings
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.settings import Settings
+from thermoctl.rig.channels import DEFAULT, Channels
 from thermoctl.yamlfile import InputError, suggest
 from thermoctl_hal.backend import OK, STALE, Sample
 from thermoctl_hal.units import role_units

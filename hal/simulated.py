@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import AT, DEFAULT, Channels
+from thermoctl.configuration.settings import Settings
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
 from thermoctl.plant.sensor import SlowError
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.settings import Settings
+from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.daemon.view import demo_folder
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon.views.demo import demo_folder
 from thermoctl.recording.reader import read_rows
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config/simulated.yaml"

@@ -3,9 +3,9 @@
 import os
 import shutil
 
+from thermoctl.configuration.settings import options
 from thermoctl.control.faults import FAULTS, KINDS
 from thermoctl.reference import DOCS, pages, stale
-from thermoctl.settings import options
 
 
 def test_pages_are_not_stale():

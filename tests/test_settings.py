@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from thermoctl import settings
+from thermoctl.configuration import settings
 from thermoctl.yamlfile import InputError
 
 SIMULATED = Path(__file__).parent.parent / "config" / "simulated.yaml"

@@ -2,7 +2,8 @@
 
 import pytest
 
-from thermoctl import cli, which_rig
+from thermoctl import cli
+from thermoctl.configuration import which_rig
 from thermoctl.shipped import COPIED, shipped
 from thermoctl.yamlfile import InputError
 

@@ -7,8 +7,9 @@ import os
 import sys
 from collections.abc import Sequence
 
-from thermoctl import __version__, which_rig
+from thermoctl import __version__
 from thermoctl.commands import AXIS, COMMANDS, GROUPS, call, takes_axis
+from thermoctl.configuration import which_rig
 from thermoctl.extras import lacking
 from thermoctl.yamlfile import InputError
 

@@ -110,7 +110,7 @@ _DAEMON = (
     _command(
         "demo",
         "run the closed loop on a simulated rig with a live view; Ctrl-C stops it safely",
-        "thermoctl.daemon.view:demo",
+        "thermoctl.daemon.views.demo:demo",
         "settings seconds",
         CONFIG,
         _arg("--seconds", type=float, metavar="S", help="stop after S seconds"),
@@ -174,7 +174,7 @@ _DAEMON = (
     _command(
         "check",
         "check a configuration with its model, plant and profiles; touches no hardware",
-        "thermoctl.daemon.doctor:check",
+        "thermoctl.daemon.offline.doctor:check",
         "settings",
         _FILE,
         CONFIG,
@@ -182,7 +182,7 @@ _DAEMON = (
     _command(
         "doctor",
         "connect to the devices and show every channel with value, unit and rate; drives nothing",
-        "thermoctl.daemon.doctor:doctor",
+        "thermoctl.daemon.offline.doctor:doctor",
         "settings seconds",
         _FILE,
         CONFIG,
@@ -237,7 +237,7 @@ _DAEMON = (
     _command(
         "replay",
         "run a recording's inputs through the control law; exit 1 when one output bit differs",
-        "thermoctl.daemon.replay:command",
+        "thermoctl.daemon.offline.replay:command",
         "recording",
         _arg("recording", metavar="RECORDING"),
     ),
@@ -741,7 +741,7 @@ _PEOPLE = (
     _command(
         "dashboard",
         "serve the rig's page for the browser: read-only and on this machine only, unless options say otherwise",
-        "thermoctl.daemon.dashboard:serve",
+        "thermoctl.daemon.views.dashboard:serve",
         "settings listen commands metrics token_file rate name",
         CONFIG,
         _arg(
@@ -769,7 +769,7 @@ _PEOPLE = (
     _command(
         "monitor",
         "show the rig in the terminal, for instance over ssh; gives no commands",
-        "thermoctl.daemon.monitor:show",
+        "thermoctl.daemon.views.monitor:show",
         "settings interval once",
         CONFIG,
         _arg(
@@ -788,7 +788,7 @@ _PEOPLE = (
     _command(
         "mqtt",
         "publish state, faults and availability to an MQTT broker; accepts no commands",
-        "thermoctl.daemon.mqtt:publish",
+        "thermoctl.daemon.views.mqtt:publish",
         "settings broker topic rate user password_file tls",
         CONFIG,
         _arg("--broker", required=True, metavar="HOST[:PORT]", help="the broker"),
@@ -881,7 +881,7 @@ def call(command: Command, args: argparse.Namespace) -> int:
     function = getattr(importlib.import_module(module), name)
     takes = command.takes.split()
     if "settings" in takes:
-        from thermoctl.settings import load_rig, load_settings
+        from thermoctl.configuration.settings import load_rig, load_settings
 
         each = command.name in EACH_AXIS and "#" not in args.config
         whole = each or command.name in WHOLE_RIG and "#" not in args.config
@@ -920,7 +920,7 @@ def _each_axis(function: Any, takes: list[str], args: argparse.Namespace) -> int
 
 def run(args: argparse.Namespace) -> int:
     """Run the daemon in the foreground, or its tick in simulated time."""
-    from thermoctl.settings import load_rig, load_settings
+    from thermoctl.configuration.settings import load_rig, load_settings
 
     if args.hours is None:
         from thermoctl.daemon import supervisor
@@ -932,7 +932,7 @@ def run(args: argparse.Namespace) -> int:
             )
 
         return supervisor.run(load_rig(args.config))
-    from thermoctl.daemon.simulate import trapezoids
+    from thermoctl.daemon.offline.simulate import trapezoids
 
     return trapezoids(load_settings(args.config), args.hours, not args.no_compensation, args.out)
 

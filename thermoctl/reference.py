@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import Any, cast
 
 from thermoctl import api
-from thermoctl.channels import DEFAULT
 from thermoctl.cli import parser
+from thermoctl.configuration.settings import SECTIONS, options
+from thermoctl.configuration.which_rig import ACTS
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.diagnose.catalogue import catalogue
-from thermoctl.settings import SECTIONS, options
-from thermoctl.signals import FAULT_WORD_BITS, SIGNALS
-from thermoctl.which_rig import ACTS
+from thermoctl.rig.channels import DEFAULT
+from thermoctl.rig.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl_hal.key import REQUIRED, Key
 from thermoctl_hal.keys import TABLES
 

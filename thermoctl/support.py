@@ -16,10 +16,10 @@ from importlib import metadata
 from pathlib import Path
 
 from thermoctl import __version__
+from thermoctl.configuration.settings import Settings, effective
 from thermoctl.daemon.service import log_path
 from thermoctl.recording.reader import export, info
 from thermoctl.recording.writer import FULL, recording_files
-from thermoctl.settings import Settings, effective
 from thermoctl.yamlfile import InputError
 
 LOG_BYTES = 1_000_000  # from the log's end

@@ -30,8 +30,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from thermoctl.channels import AxesChannels
-from thermoctl.settings import Settings
+from thermoctl.configuration.settings import Settings
+from thermoctl.rig.channels import AxesChannels
 from thermoctl.yamlfile import InputError, suggest
 from thermoctl_hal.binding import Binding, bind, check_rig
 from thermoctl_hal.simulated import make_rig

@@ -288,8 +288,8 @@ def casadi_functions(plant, table):
 
 def closed_loop(seconds):
     """CPU seconds for `seconds` of the daemon's own tick with the whole actuator as its rig."""
-    from thermoctl.daemon.simulate import Simulation
-    from thermoctl.settings import load_settings
+    from thermoctl.configuration.settings import load_settings
+    from thermoctl.daemon.offline.simulate import Simulation
 
     rig = Simulation(load_settings("config/simulated.yaml"))
     rig.arm()
@@ -304,11 +304,11 @@ def closed_loop(seconds):
 def law_and_plant(seconds):
     """The law (estimator, compensation, PID, protection) closed over the whole actuator, nothing between them: CPU seconds
     of `seconds`, how long the plant alone takes, and the position where the setpoint was 50 um."""
-    from thermoctl.channels import CHANNELS
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.control import arming
     from thermoctl.control.law import Law
-    from thermoctl.daemon.assemble import compensator, law_parameters
-    from thermoctl.settings import load_settings
+    from thermoctl.daemon.tick.assemble import compensator, law_parameters
+    from thermoctl.rig.channels import CHANNELS
 
     settings = load_settings("config/simulated.yaml")
     model = compile_plant(load("config/plants/actuator.yaml"), ())

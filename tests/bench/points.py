@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from tests.bench.realtime.run import law_numbers
-from thermoctl.channels import AT, COIL, DEFAULT, Channels, Point, of_points
 from thermoctl.control.law import COMPILED, Law
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.loop import Rig
-from thermoctl.daemon.ring import Ring
-from thermoctl.signals import OUTPUTS, of_channels
+from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.ring import Ring
+from thermoctl.rig.channels import AT, COIL, DEFAULT, Channels, Point, of_points
+from thermoctl.rig.signals import OUTPUTS, of_channels
 from thermoctl_hal.backend import ABSENT, OK, Sample
 
 TICKS, REPEATS = 5000, 15

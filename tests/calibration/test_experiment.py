@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from thermoctl import cli
+from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import tuner
-from thermoctl.daemon.assemble import compensator
-from thermoctl.daemon.simulate import Simulation
+from thermoctl.daemon.offline.simulate import Simulation
+from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
 from thermoctl.recording.files import read_table
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

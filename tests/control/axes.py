@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 
 import thermoctl_hal.axes
-from thermoctl import channels
-from thermoctl.channels import AT, COIL
 from thermoctl.control import arming, faults
 from thermoctl.control.model import Parameters, zero_model
-from thermoctl.daemon import loop, processes
-from thermoctl.daemon.ring import Mailbox
-from thermoctl.signals import AT as SIGNAL_AT
-from thermoctl.signals import fault_word
+from thermoctl.daemon import processes
+from thermoctl.daemon.tick import loop
+from thermoctl.daemon.tick.ring import Mailbox
+from thermoctl.rig import channels
+from thermoctl.rig.channels import AT, COIL
+from thermoctl.rig.signals import AT as SIGNAL_AT
+from thermoctl.rig.signals import fault_word
 from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
 
 MUTATED = (

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from tests.limits import OFF
-from thermoctl.channels import CHANNELS, DEFAULT, GROUPS, INDEX, TEMPERATURES
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.signals import OUTPUT
+from thermoctl.rig.channels import CHANNELS, DEFAULT, GROUPS, INDEX, TEMPERATURES
+from thermoctl.rig.signals import OUTPUT
 
 P = 2.0**-10  # period, s
 AIR = 22.0

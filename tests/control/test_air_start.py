@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.daemon.simulate import Simulation
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon.offline.simulate import Simulation
+from thermoctl.rig.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[2]
 AIR_NOISE_C = 0.02  # config/simulated.yaml

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.limits import OFF
-from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults, law
 from thermoctl.control.law import AIR_READINGS, OUTPUTS, Law
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
+from thermoctl.rig.channels import CHANNELS
 
 INDEX = {name: i for i, name in enumerate(CHANNELS)}
 OUT = {name: i for i, name in enumerate(OUTPUTS)}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.limits import OFF
-from thermoctl.channels import CHANNELS
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS, Law
 from thermoctl.control.model import Parameters, zero_model
+from thermoctl.rig.channels import CHANNELS
 
 P, AIR, COIL = 0.001, CHANNELS.index("air_c"), CHANNELS.index("coil_c")
 LIMIT = {AIR: 5.0, COIL: 20.0}  # K/s

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import thermoctl
-from thermoctl.channels import AT, COIL, DEFAULT, FIXED, GROUPS, MAX_POINTS, Point, of_points
 from thermoctl.control import faults, recorded_faults, typed
 from thermoctl.control.model import CompensatorModel, zero_model
 from thermoctl.daemon.keep import _fingerprint
-from thermoctl.signals import INDEX, NAMES, PAPER, fault_word, fault_words, of_channels
+from thermoctl.rig.channels import AT, COIL, DEFAULT, FIXED, GROUPS, MAX_POINTS, Point, of_points
+from thermoctl.rig.signals import INDEX, NAMES, PAPER, fault_word, fault_words, of_channels
 
 PRODUCT = Path(thermoctl.__file__).parent
 
@@ -84,13 +84,14 @@ def test_a_channel_is_added_in_one_row():
     end = '    Channel("amplifier_fault", "1", "amplifier", "the amplifier\'s own error code; 0 none", 0.0, code=True),\n'
     row = '    Channel("humidity", "1", "monitored", "humidity of the chamber", 0.0, 1.0),\n'
     found = run_with(
-        {"thermoctl.channels": (end, end + row)},
+        {"thermoctl.rig.channels": (end, end + row)},
         """
 import numpy as np
 from thermoctl_hal.backend import ROLES, Sample
-from thermoctl import channels, signals, reference
+from thermoctl import reference
+from thermoctl.rig import channels, signals
 from thermoctl.control import causes, faults, law, model
-from thermoctl.daemon import readings
+from thermoctl.daemon.answers import readings
 from thermoctl.control.model import Parameters, zero_model
 p = Parameters(0.0, 1.0, 0.0, 1.0)
 new = channels.AT["humidity"]
@@ -134,9 +135,10 @@ def test_a_limit_is_added_in_one_row(tmp_path):
     found = run_with(
         {"thermoctl.control.limits": (anchor, row + anchor)},
         f"""
-from thermoctl import reference, settings
+from thermoctl import reference
+from thermoctl.configuration import settings
 from thermoctl.control import law, model, typed
-from thermoctl.daemon.assemble import law_parameters
+from thermoctl.daemon.tick.assemble import law_parameters
 p = law_parameters(settings.load_settings({str(config)!r}))
 tick = law.Law(model.zero_model(), model.Parameters.unpack(p.pack()), 0.001)
 text = (typed.HERE / "law.pxd").read_text()
@@ -159,7 +161,8 @@ def test_a_fault_is_added_in_one_row():
         },
         """
 import numpy as np
-from thermoctl import reference, signals
+from thermoctl import reference
+from thermoctl.rig import signals
 from thermoctl.control import arming, faults, law, recorded_faults
 from thermoctl.control.model import Parameters, zero_model
 tick = law.Law(zero_model(), Parameters(0.0, 1.0, 0.0, 1.0), 0.001)

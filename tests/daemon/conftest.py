@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.daemon.process import patient
+from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import CompensatorModel
-from thermoctl.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import psutil
 
-from thermoctl.daemon.assemble import shared_name
+from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
-from thermoctl.settings import load_settings
+from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,12 +12,12 @@ import pytest
 
 from tests.daemon.process import ROOT, Daemon, patient, wait
 from thermoctl import cli
+from thermoctl.configuration.which_rig import ACTS
 from thermoctl.daemon import lock
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
-from thermoctl.which_rig import ACTS
 
 OTHER = ["--config", "{other}"]  # a rig that nobody runs
 BESIDE = {  # command: (arguments, exit status) by which a person who means something else could hurt the daemon's rig

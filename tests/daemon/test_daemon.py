@@ -15,9 +15,9 @@ import pytest
 
 from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
+from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
 from thermoctl.recording.reader import info
-from thermoctl.settings import load_settings
 
 
 @pytest.fixture

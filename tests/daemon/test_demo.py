@@ -14,9 +14,10 @@ import pytest
 
 from tests.daemon.process import LIMIT_S, ROOT, wait
 from thermoctl.cli import main
-from thermoctl.daemon import lock, view
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon import lock
 from thermoctl.daemon.control_socket import ask
-from thermoctl.settings import load_settings
+from thermoctl.daemon.views import demo as view
 
 
 class Shown:

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from thermoctl.daemon import doctor
-from thermoctl.daemon.doctor import cpu_list, real_time_checks
+from thermoctl.daemon.offline import doctor
+from thermoctl.daemon.offline.doctor import cpu_list, real_time_checks
 
 GOOD = {
     "sys/kernel/realtime": "1",

@@ -9,18 +9,19 @@ import yaml
 
 from tests.people.running import Running
 from tests.rigs.chain import plants, rig_text
-from thermoctl.channels import DEFAULT, MAX_POINTS, of_text
 from thermoctl.cli import main
-from thermoctl.daemon import metrics, readings, snapshot
-from thermoctl.daemon.display import value_lines
+from thermoctl.configuration.settings import effective, load_settings
+from thermoctl.daemon.answers import readings, snapshot
+from thermoctl.daemon.answers.display import value_lines
+from thermoctl.daemon.offline.replay import replay
+from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.daemon.recorder import law_metadata
-from thermoctl.daemon.replay import replay
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.simulate import Simulation
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.daemon.views import metrics
 from thermoctl.recording.reader import read_rows
 from thermoctl.recording.writer import FULL, RecordingWriter, recording_files
-from thermoctl.settings import effective, load_settings
-from thermoctl.signals import AT, of_channels, recorded_states
+from thermoctl.rig.channels import DEFAULT, MAX_POINTS, of_text
+from thermoctl.rig.signals import AT, of_channels, recorded_states
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.virtual.rig import VirtualRig
 
@@ -155,7 +156,7 @@ def test_a_full_row_of_64_points_is_replayed(tmp_path):
 def test_a_model_of_other_points_is_refused(spindle, tmp_path):
     text = (tmp_path / "rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(text.replace("rear_bearing", "back_bearing"))
-    from thermoctl.daemon.assemble import compensator
+    from thermoctl.daemon.tick.assemble import compensator
 
     with pytest.raises(
         InputError, match=r"model is of motor, .*rear_bearing.*the rig has .*back_bearing.*calibrate"
@@ -214,8 +215,8 @@ def test_without_a_declaration_the_points_are_the_papers(tmp_path):
 def test_the_dashboard_draws_the_points(spindle):
     import threading
 
-    from thermoctl.daemon.dashboard import drawing, make_server, url
-    from thermoctl.daemon.watch import Watch
+    from thermoctl.daemon.views.dashboard import drawing, make_server, url
+    from thermoctl.daemon.views.watch import Watch
 
     server = make_server(spindle, "127.0.0.1:0", Watch(spindle))
     threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()

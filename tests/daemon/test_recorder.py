@@ -13,8 +13,8 @@ from tests.limits import OFF
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
 from thermoctl.daemon.recorder import Recorder
-from thermoctl.daemon.shared import RECORDER_ROWS, Shared
-from thermoctl.signals import INDEX, SIGNALS
+from thermoctl.daemon.tick.shared import RECORDER_ROWS, Shared
+from thermoctl.rig.signals import INDEX, SIGNALS
 
 SIGMA = np.sqrt(make_model().R_v)
 

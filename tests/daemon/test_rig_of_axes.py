@@ -7,8 +7,8 @@ import pytest
 
 from tests.rigs.axes import simulated_axes
 from thermoctl import cli
-from thermoctl.daemon.assemble import shared_name
-from thermoctl.settings import load_rig, load_settings
+from thermoctl.configuration.settings import load_rig, load_settings
+from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.yamlfile import InputError
 
 

@@ -12,9 +12,9 @@ import pytest
 
 from tests.daemon.process import ROOT, Daemon
 from thermoctl.cli import main
+from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import lock, service
 from thermoctl.manual import PLACES
-from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError
 
 
@@ -101,7 +101,7 @@ def test_looking_at_the_lock_never_keeps_a_daemon_from_taking_it(settings):
         [
             sys.executable,
             "-c",
-            "import sys; from thermoctl.daemon.lock import holder; from thermoctl.settings import load_settings\n"
+            "import sys; from thermoctl.daemon.lock import holder; from thermoctl.configuration.settings import load_settings\n"
             "s = load_settings(sys.argv[1]); print('on', flush=True)\nwhile True: holder(s)",
             settings.path,
         ],

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermoctl.daemon.clock import now_ns, sleep_until
-from thermoctl.daemon.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
-from thermoctl.daemon.shared import Shared, percentiles
-from thermoctl.daemon.snapshot import latency
-from thermoctl.signals import OUTPUTS
+from thermoctl.daemon.answers.snapshot import latency
+from thermoctl.daemon.tick.clock import now_ns, sleep_until
+from thermoctl.daemon.tick.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
+from thermoctl.daemon.tick.shared import Shared, percentiles
+from thermoctl.rig.signals import OUTPUTS
 from thermoctl.yamlfile import InputError
 
 

@@ -8,14 +8,14 @@ import pytest
 
 import thermoctl
 from tests.daemon.conftest import make_model
-from thermoctl.channels import CHANNELS, DEFAULT
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
-from thermoctl.daemon.assemble import law_parameters
+from thermoctl.daemon.offline.replay import replay
+from thermoctl.daemon.offline.simulate import Simulation, run_simulated
 from thermoctl.daemon.recorder import LAW_VERSION, law_metadata, read_law_metadata
-from thermoctl.daemon.replay import replay
-from thermoctl.daemon.simulate import Simulation, run_simulated
-from thermoctl.signals import INDEX, NAMES, SIGNALS
+from thermoctl.daemon.tick.assemble import law_parameters
+from thermoctl.rig.channels import CHANNELS, DEFAULT
+from thermoctl.rig.signals import INDEX, NAMES, SIGNALS
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import ERROR, OK, ROLE, ROLES, STALE
 
@@ -34,7 +34,7 @@ def test_one_list_of_names():
 
 def test_the_tick_is_the_block_diagram():
     source = (
-        Path(thermoctl.__file__).parent / "daemon/loop.py"
+        Path(thermoctl.__file__).parent / "daemon/tick/loop.py"
     ).read_text()  # the module that runs is compiled
     lines = [
         line.strip()

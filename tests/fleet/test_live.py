@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.daemon.assemble import compensator
+from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
-from thermoctl.daemon.simulate import run_simulated
+from thermoctl.daemon.offline.simulate import run_simulated
+from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 
 ROOT = Path(__file__).parents[2]
 

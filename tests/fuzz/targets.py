@@ -59,8 +59,8 @@ def plant() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def config() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A configuration, with its device profiles and faults."""
-    from thermoctl.daemon.assemble import law_parameters
-    from thermoctl.settings import effective, load_settings
+    from thermoctl.configuration.settings import effective, load_settings
+    from thermoctl.daemon.tick.assemble import law_parameters
     from thermoctl_hal.binding import bind
     from thermoctl_hal.faulty import schedule
     from thermoctl_hal.read_profile import load_profile
@@ -259,10 +259,10 @@ def commands() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Requests to the daemon's socket, on a ring with one row."""
     import numpy as np
 
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.daemon import command_server as room
-    from thermoctl.daemon.shared import Shared
-    from thermoctl.settings import load_settings
-    from thermoctl.signals import SIGNALS
+    from thermoctl.daemon.tick.shared import Shared
+    from thermoctl.rig.signals import SIGNALS
 
     settings = load_settings(ROOT / "config/simulated.yaml")
     shared = Shared.create(f"thermoctl-fuzz-{os.getpid()}")
@@ -295,9 +295,9 @@ def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:
     from thermoctl.control.law import Law
     from thermoctl.control.model import Parameters, zero_model
     from thermoctl.daemon import keep
+    from thermoctl.daemon.offline.replay import replay
     from thermoctl.daemon.recorder import law_metadata
-    from thermoctl.daemon.replay import replay
-    from thermoctl.signals import SIGNALS
+    from thermoctl.rig.signals import SIGNALS
     from thermoctl.yamlfile import InputError
 
     model, parameters = zero_model(), Parameters(kp=0.1, ti_s=1.0, td_s=0.0, output_limit=1.0)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from thermoctl import yamlfile
-from thermoctl.channels import DEFAULT
+from thermoctl.rig.channels import DEFAULT
 from thermoctl_hal.backend import ROLE, STATUS_NAMES, Sample
 from thermoctl_hal.virtual.rig import VirtualRig
 

@@ -515,7 +515,7 @@ def test_lawicel_text_as_in_its_manual():
 def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path):
     from types import SimpleNamespace
 
-    from thermoctl.channels import DEFAULT
+    from thermoctl.rig.channels import DEFAULT
     from thermoctl_hal.make import disable_amplifier
 
     drive, m = bus.drive(5), bus.master(5)

@@ -14,15 +14,15 @@ import pytest
 from tests.hal.conftest import CONFIG
 from tests.limits import OFF
 from thermoctl import yamlfile
+from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import Parameters, zero_model
-from thermoctl.daemon.arrival import device_counters, put_counters, slow_readings
-from thermoctl.daemon.clock import now_ns
+from thermoctl.daemon.answers.display import counter_lines
 from thermoctl.daemon.command_server import Commands
-from thermoctl.daemon.display import counter_lines
-from thermoctl.daemon.loop import Rig, run_loop
-from thermoctl.daemon.shared import Shared
-from thermoctl.settings import load_settings
-from thermoctl.signals import AT, INDEX
+from thermoctl.daemon.tick.arrival import device_counters, put_counters, slow_readings
+from thermoctl.daemon.tick.clock import now_ns
+from thermoctl.daemon.tick.loop import Rig, run_loop
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.rig.signals import AT, INDEX
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import ROLE
 from thermoctl_hal.binding import bind

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
-from thermoctl.settings import load_settings
+from thermoctl.configuration.settings import load_settings
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.binding import bind, check_rig, resolve_port
 from thermoctl_hal.make import make_devices
@@ -190,7 +190,7 @@ def test_the_virtual_rig_refuses_a_bus_it_cannot_play():
 
 
 def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
-    from thermoctl.daemon.doctor import check
+    from thermoctl.daemon.offline.doctor import check
 
     (tmp_path / "module.yaml").write_text(MODULE.replace("register: 0,", "register: 40001,"))
     (tmp_path / "rig.yaml").write_text(

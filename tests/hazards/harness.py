@@ -13,11 +13,11 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from thermoctl.configuration.settings import load_settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.simulate import Simulation
+from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.plant import load
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 from thermoctl_hal.backend import ROLE
 from thermoctl_hal.faulty import Fault, FaultInjector
 

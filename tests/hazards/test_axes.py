@@ -10,12 +10,12 @@ import pytest
 from tests.daemon.process import forget, wait
 from tests.rigs.axes import Axes, simulated_axes
 from tests.rigs.wire import WireRig
-from thermoctl.channels import AT
-from thermoctl.daemon.assemble import shared_name
+from thermoctl.configuration.settings import load_rig
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.shared import LOOP_PID, Shared
-from thermoctl.settings import load_rig
-from thermoctl.signals import AT as SIGNAL_AT
+from thermoctl.daemon.tick.assemble import shared_name
+from thermoctl.daemon.tick.shared import LOOP_PID, Shared
+from thermoctl.rig.channels import AT
+from thermoctl.rig.signals import AT as SIGNAL_AT
 from thermoctl_hal.make import make_backends
 
 GO_ON = "  on_other_axis_fault: go_on"

@@ -12,9 +12,9 @@ from tests.limits import OFF
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
-from thermoctl.daemon.loop import RELOAD, Rig
-from thermoctl.daemon.ring import Box, Mailbox
-from thermoctl.signals import INDEX
+from thermoctl.daemon.tick.loop import RELOAD, Rig
+from thermoctl.daemon.tick.ring import Box, Mailbox
+from thermoctl.rig.signals import INDEX
 from thermoctl_hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 
 NEEDED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c", "amplifier_state")

@@ -15,7 +15,7 @@ import pytest
 
 from tests.daemon.process import LIMIT_S, Daemon, wait
 from tests.hazards.harness import ROOT, ROWS, Row
-from thermoctl.daemon.assemble import shared_name
+from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 
@@ -223,7 +223,7 @@ def test_the_supervisor_stopped_and_killed(daemon, tmp_path):
 @pytest.mark.parametrize("left", [b"", b"x" * 8, b"\0" * 4096, b"\xff" * 20_000_000])
 def test_leftovers_in_shared_memory(tmp_path, left):
     """Whatever stands under the segment's name is replaced, and told where it is attached to."""
-    from thermoctl.daemon.shared import Shared
+    from thermoctl.daemon.tick.shared import Shared
 
     name = f"thermoctl-hazard-{os.getpid()}"
     Path("/dev/shm", name).write_bytes(left)

@@ -7,10 +7,10 @@ import pytest
 
 from tests.hazards.harness import ROWS, HazardRig, Row, say
 from thermoctl.control import arming
-from thermoctl.daemon import loop as loops
-from thermoctl.daemon.assemble import law_parameters
 from thermoctl.daemon.reload import reload_settings
-from thermoctl.daemon.ring import Histogram
+from thermoctl.daemon.tick import loop as loops
+from thermoctl.daemon.tick.assemble import law_parameters
+from thermoctl.daemon.tick.ring import Histogram
 from thermoctl.yamlfile import InputError
 
 

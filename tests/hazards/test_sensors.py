@@ -5,7 +5,7 @@ import math
 import pytest
 
 from tests.hazards.harness import say
-from thermoctl.channels import TEMPERATURES
+from thermoctl.rig.channels import TEMPERATURES
 
 OTHERS = TEMPERATURES[1:]
 SENSORS = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c", *TEMPERATURES)

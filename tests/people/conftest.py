@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from browser import Browser, find
 
-from thermoctl.settings import load_settings
+from thermoctl.configuration.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 

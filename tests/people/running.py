@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.command_server import Commands, listen, serve
-from thermoctl.daemon.loop import Rig
-from thermoctl.daemon.shared import Shared
-from thermoctl.signals import INDEX
+from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.rig.signals import INDEX
 from thermoctl_hal.backend import ERROR, OK, ROLE
 from thermoctl_hal.make import make_backend
 

@@ -17,13 +17,13 @@ from thermoctl.calibration import daemon_rig
 from thermoctl.calibration.daemon_rig import DaemonRig, at_rest
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
-from thermoctl.daemon.snapshot import status
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon.answers.snapshot import status
 from thermoctl.identify import modelfile
 from thermoctl.identify.experiments import Aborted, load_experiments
 from thermoctl.recording.files import read_table
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = """\

@@ -13,9 +13,9 @@ import pytest
 
 from tests.hazards.harness import HazardRig, quick_settings
 from tests.hazards.test_wires import ERROR_FRAME, KernelBus, WiredRig
-from thermoctl.daemon.display import fault_lines, message_lines
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.snapshot import status
+from thermoctl.daemon.answers.display import fault_lines, message_lines
+from thermoctl.daemon.answers.snapshot import status
+from thermoctl.daemon.tick.shared import Shared
 from thermoctl_hal.backend import ROLE
 
 ROWS: list[tuple[str, str, str, str]] = []

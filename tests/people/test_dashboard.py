@@ -18,14 +18,15 @@ from rich.console import Console
 from rich.terminal_theme import DIMMED_MONOKAI
 from running import Running
 
-from thermoctl.daemon import dashboard, monitor, view
+from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.command_server import Commands
-from thermoctl.daemon.metrics import metrics
-from thermoctl.daemon.snapshot import status
-from thermoctl.daemon.watch import Watch
+from thermoctl.daemon.views import dashboard, monitor
+from thermoctl.daemon.views import demo as view
+from thermoctl.daemon.views.metrics import metrics
+from thermoctl.daemon.views.watch import Watch
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.rig.signals import INDEX, POINTS, SIGNALS
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

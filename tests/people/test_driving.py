@@ -19,12 +19,12 @@ from thermoctl.calibration import drive
 from thermoctl.calibration.commands import record
 from thermoctl.calibration.schedules import forecast
 from thermoctl.calibration.simulated_rig import SimulatedRig
+from thermoctl.configuration.settings import load_settings
 from thermoctl.control import arming
+from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.control_socket import Connection, ask
-from thermoctl.daemon.snapshot import status
 from thermoctl.identify.experiments import Schedule
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import ROLE
 from thermoctl_hal.faulty import Fault, FaultInjector
@@ -369,7 +369,7 @@ def test_the_drive_itself_is_off_whatever_is_killed(tmp_path):
 
 
 def _loop_pid(chain):
-    from thermoctl.daemon.assemble import shared_name
-    from thermoctl.daemon.shared import LOOP_PID, Shared
+    from thermoctl.daemon.tick.assemble import shared_name
+    from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 
     return Shared.attach(shared_name(load_settings(chain.config))).counters[LOOP_PID]

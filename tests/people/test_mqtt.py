@@ -11,7 +11,7 @@ import time
 import pytest
 
 from thermoctl import cli
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 LIMIT_S = 20.0
@@ -68,7 +68,7 @@ class Reader:
 
 
 def test_state_faults_and_availability(settings, running, broker):
-    from thermoctl.daemon.mqtt import Bridge
+    from thermoctl.daemon.views.mqtt import Bridge
 
     running.arm()
     running.run()
@@ -111,7 +111,7 @@ def test_what_is_refused(settings, capsys):
     pytest.importorskip(
         "paho.mqtt.client", reason="paho-mqtt is not installed: pip install 'thermoctl[mqtt]'"
     )
-    from thermoctl.daemon.mqtt import Bridge
+    from thermoctl.daemon.views.mqtt import Bridge
 
     for arguments, message in (
         ({"broker": "host:port"}, "HOST:PORT"),

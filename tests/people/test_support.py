@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from thermoctl import cli
+from thermoctl.configuration.settings import load_settings
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.settings import load_settings
 from thermoctl.support import without_secrets
 
 

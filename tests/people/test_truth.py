@@ -14,19 +14,20 @@ from rich.console import Console
 from running import Running
 from test_dashboard import served
 
-from thermoctl.channels import CHANNELS
 from thermoctl.control import causes, faults
 from thermoctl.control.causes import Standing, in_order
-from thermoctl.daemon import commands, dashboard, monitor
+from thermoctl.daemon import commands
+from thermoctl.daemon.answers.display import fault_lines
+from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.command_server import Commands
-from thermoctl.daemon.display import fault_lines
 from thermoctl.daemon.journal import Watcher
-from thermoctl.daemon.metrics import metrics
-from thermoctl.daemon.snapshot import status
+from thermoctl.daemon.views import dashboard, monitor
+from thermoctl.daemon.views.metrics import metrics
 from thermoctl.recording.commands import list_recordings
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.signals import INDEX, POINTS, SIGNALS
+from thermoctl.rig.channels import CHANNELS
+from thermoctl.rig.signals import INDEX, POINTS, SIGNALS
 from thermoctl_hal.backend import ERROR, OK, ROLE, STALE
 from thermoctl_hal.drive_errors import describe
 
@@ -378,7 +379,7 @@ def test_two_rigs_in_one_folder_are_never_mixed(settings, capsys):
 def test_a_rig_without_a_name_is_known_by_its_configuration(settings):
     import dataclasses
 
-    from thermoctl.daemon.assemble import rig_identity
+    from thermoctl.daemon.tick.assemble import rig_identity
 
     unnamed = dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, name="rig"))
     other = dataclasses.replace(unnamed, path="/elsewhere/rig.yaml")

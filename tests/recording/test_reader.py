@@ -15,7 +15,7 @@ from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.reader import export, info, read_rows, recover
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter
-from thermoctl.signals import INDEX
+from thermoctl.rig.signals import INDEX
 from thermoctl.yamlfile import InputError
 
 

@@ -14,7 +14,7 @@ import thermoctl.recording.writer as writing
 from thermoctl.recording.files import read_table
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter, recording_files
-from thermoctl.signals import INDEX, SIGNALS
+from thermoctl.rig.signals import INDEX, SIGNALS
 from thermoctl.yamlfile import InputError
 
 RNG = np.random.default_rng(1)

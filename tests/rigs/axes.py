@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from tests.rigs.chain import plants
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.assemble import compensator, law_parameters
-from thermoctl.daemon.loop import Rig
+from thermoctl.daemon.offline.simulate import COMMANDS
 from thermoctl.daemon.processes import guard
-from thermoctl.daemon.ring import Mailbox
-from thermoctl.daemon.simulate import COMMANDS
-from thermoctl.settings import Settings
-from thermoctl.signals import AT, fault_word
+from thermoctl.daemon.tick.assemble import compensator, law_parameters
+from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.ring import Mailbox
+from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.make import make_backends
 
 NAMES = ("x", "y", "z", "u")

@@ -19,12 +19,12 @@ from tests.rigs.chain import plants, rig_text
 from thermoctl.calibration import chain
 from thermoctl.calibration.recorded import Recorded, filled, of_columns
 from thermoctl.calibration.simulated_rig import with_model
+from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.assemble import compensator
-from thermoctl.daemon.simulate import run_simulated
+from thermoctl.daemon.offline.simulate import run_simulated
+from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.identify.modelfile import save_model
-from thermoctl.settings import Settings, load_settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 
 RIGS = {
     "a coil and a bench": (("coil", "bench"), "torque"),

@@ -10,7 +10,7 @@ import pytest
 
 from tests.hal.conftest import free_port
 from tests.rigs.axes import Axes
-from thermoctl.settings import load_rig
+from thermoctl.configuration.settings import load_rig
 from thermoctl_hal.make import make_backends
 from thermoctl_hal.virtual.rig import VirtualRig
 

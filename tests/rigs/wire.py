@@ -17,7 +17,7 @@ from pathlib import Path
 from tests.devices.emulators import Frame, ModbusLine, Port, SlcanAdapter, Unit, encode
 from tests.devices.test_drives import AXIS_DBC, POSITION_DRIVE, Drive, Positioner
 from tests.rigs.chain import plants
-from thermoctl.channels import Channels, Point, of_points
+from thermoctl.rig.channels import Channels, Point, of_points
 from thermoctl_hal.simulated import PlantRig, Surrounding
 
 PERIOD_S, AIR_C, WATCHDOG_S = 0.005, 22.0, 0.6

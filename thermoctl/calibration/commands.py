@@ -13,10 +13,10 @@ import numpy as np
 from thermoctl.calibration import chain, drive, experiment, iso230, recorded, schedules
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.wizard import Wizard
+from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
-from thermoctl.settings import Settings, load_settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import HardwareError
 

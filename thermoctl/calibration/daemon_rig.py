@@ -18,17 +18,17 @@ import numpy as np
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table, causes, rows_of
 from thermoctl.calibration.simulated_rig import EVERY_S
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.assemble import shared_name
 from thermoctl.daemon.control_socket import Connection, ask
-from thermoctl.daemon.shared import Shared
+from thermoctl.daemon.tick.assemble import shared_name
+from thermoctl.daemon.tick.shared import Shared
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import HardwareError
 

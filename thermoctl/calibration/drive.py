@@ -18,11 +18,11 @@ from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.schedules import forecast, span, within_limits
 from thermoctl.calibration.simulated_rig import SimulatedRig
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.daemon.control_socket import ask
 from thermoctl.identify.experiments import Aborted, Schedule
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import HardwareError
 from thermoctl_hal.make import make_devices

@@ -13,12 +13,12 @@ from thermoctl.calibration import drive, schedules
 from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
+from thermoctl.configuration.settings import Settings
 from thermoctl.identify import experiments
 from thermoctl.plant import load
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 ENDED = 3  # exit status of a test that ended early

@@ -13,7 +13,7 @@ import numpy as np
 from thermoctl.control import faults
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.signals import AT, Row, fault_word
+from thermoctl.rig.signals import AT, Row, fault_word
 from thermoctl.yamlfile import InputError, suggest
 
 EVERY_RIG = ("power_w", "air_c", "output_reference_um", "position_raw_um", "setpoint_um")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COPPER_1_K
-from thermoctl.daemon.assemble import compensator
+from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Schedule
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError, suggest
 
 CUTOFF_HZ = 4.3e-4  # the coil's corner: 1 / (2 pi 370 s), its time constant in test 1 of the paper

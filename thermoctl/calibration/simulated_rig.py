@@ -12,15 +12,15 @@ import numpy as np
 
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import causes
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.simulate import Simulation
-from thermoctl.daemon.snapshot import channel_states
+from thermoctl.daemon.answers.snapshot import channel_states
+from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.table import Table
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 from thermoctl_hal.backend import HardwareError
 
 EVERY_S = 0.1  # between the rows that are kept

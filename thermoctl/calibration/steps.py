@@ -18,12 +18,12 @@ from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import Recorded, read
 from thermoctl.calibration.schedules import triangles
+from thermoctl.configuration.settings import Settings
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.filter import Kalman
 from thermoctl.recording.files import read_table
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 
 FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to

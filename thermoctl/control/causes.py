@@ -18,8 +18,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from thermoctl.channels import GROUPS, Channels
 from thermoctl.control.faults import BIT, BY_NAME, KINDS
+from thermoctl.rig.channels import GROUPS, Channels
 
 WITHIN_S, BEFORE_S, TOGETHER_S = 5.0, 1.0, 0.15
 

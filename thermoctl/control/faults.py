@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from thermoctl.channels import FIXED, GROUPS
+from thermoctl.rig.channels import FIXED, GROUPS
 
 
 @dataclass(frozen=True)

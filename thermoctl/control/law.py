@@ -62,10 +62,10 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import ABSENT, AMP_ENABLED, AMP_FAULT, AT, CODES, COIL, ERROR, OK, STALE
 from thermoctl.control import arming, faults
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters
-from thermoctl.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
+from thermoctl.rig.channels import ABSENT, AMP_ENABLED, AMP_FAULT, AT, CODES, COIL, ERROR, OK, STALE
+from thermoctl.rig.signals import FAULT_WORD_BITS, OUTPUT, OUTPUTS
 
 MAX_AVERAGE = 64
 WARM_UP_TICKS = 100

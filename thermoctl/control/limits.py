@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from thermoctl.option import option
+from thermoctl.rig.option import option
 
 
 @dataclass(frozen=True)

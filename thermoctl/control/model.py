@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import DEFAULT, FIXED, MAX_POINTS
 from thermoctl.control.limits import Limits
+from thermoctl.rig.channels import DEFAULT, FIXED, MAX_POINTS
 
 MAX_ORDER = 2 * MAX_POINTS
 
@@ -180,7 +180,7 @@ class Gains:
 class Parameters(Limits, Gains):
     """Gains, limits and protection of one tick; a reload replaces them whole.
 
-    The configuration gives each field by its name (daemon/assemble.py); the law reads each by its name.
+    The configuration gives each field by its name (daemon/tick/assemble.py); the law reads each by its name.
     """
 
     def pack(self) -> np.ndarray:

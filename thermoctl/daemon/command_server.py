@@ -18,15 +18,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.control.model import Parameters
-from thermoctl.daemon import arrival
+from thermoctl.daemon.answers.display import fault_lines
+from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.control_socket import settled
-from thermoctl.daemon.display import fault_lines
-from thermoctl.daemon.loop import RELOAD
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.snapshot import latency, status
-from thermoctl.settings import Settings
+from thermoctl.daemon.tick import arrival
+from thermoctl.daemon.tick.loop import RELOAD
+from thermoctl.daemon.tick.shared import Shared
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.make import can_drive
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import json
 import sys
 
+from thermoctl.configuration.settings import Settings
+from thermoctl.daemon.answers.display import counter_lines, fault_lines, value_lines
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.display import counter_lines, fault_lines, value_lines
 from thermoctl.daemon.lock import holder
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import structlog
 
 from thermoctl.control import arming, faults
-from thermoctl.daemon import readings
-from thermoctl.daemon.display import LATE_REMEDY
-from thermoctl.daemon.shared import Shared
-from thermoctl.signals import AT, fault_words
+from thermoctl.daemon.answers import readings
+from thermoctl.daemon.answers.display import LATE_REMEDY
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.rig.signals import AT, fault_words
 
 TELL_AGAIN_S = 10.0  # an intermittent fault is logged at most once in this time
 Log = Callable[..., None]

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
-from thermoctl.settings import Settings
 
 KEEP_S = 600.0  # older estimates are useless for the rig's slow parts
 EVERY_S = 5.0  # time between two savings by the supervisor

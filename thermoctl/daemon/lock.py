@@ -10,7 +10,7 @@ import os
 import time
 from pathlib import Path
 
-from thermoctl.settings import Settings
+from thermoctl.configuration.settings import Settings
 from thermoctl.yamlfile import InputError
 
 # `hold` retries for this time. To test the lock, `holder` in another process takes it for a shorter time.

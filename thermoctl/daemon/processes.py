@@ -13,14 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.daemon import keep
-from thermoctl.daemon import loop as loops
-from thermoctl.daemon.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.command_server import Commands, listen, serve
 from thermoctl.daemon.journal import Log, console_log
 from thermoctl.daemon.reload import reload_settings
-from thermoctl.daemon.shared import BEATS, RESUMED, WARNINGS, Shared
-from thermoctl.settings import Settings
+from thermoctl.daemon.tick import loop as loops
+from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
+from thermoctl.daemon.tick.shared import BEATS, RESUMED, WARNINGS, Shared
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import Backend, HardwareError
 from thermoctl_hal.board import Board

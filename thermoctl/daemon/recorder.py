@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import faults
 from thermoctl.control.model import ARRAYS, PLAIN, CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
+from thermoctl.rig.signals import AT
 
 INTERVAL_S = 0.1
 LAW_VERSION = 4  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
@@ -201,9 +201,9 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
 
     Its files hold every option of the configuration in force, and the law's metadata.
     """
-    from thermoctl.daemon.assemble import compensator, law_parameters, rig_identity
+    from thermoctl.configuration.settings import POINTS, effective
+    from thermoctl.daemon.tick.assemble import compensator, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter
-    from thermoctl.settings import POINTS, effective
 
     config, rig = effective(settings), rig_identity(settings)
     run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from thermoctl.configuration.settings import Settings, changed, load_settings
 from thermoctl.control.model import Parameters
-from thermoctl.daemon.assemble import law_parameters
-from thermoctl.settings import Settings, changed, load_settings
+from thermoctl.daemon.tick.assemble import law_parameters
 
 
 def reload_settings(current: Settings, started: Settings) -> tuple[Any, Parameters, list[str], list[str]]:

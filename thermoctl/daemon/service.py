@@ -15,10 +15,10 @@ import sys
 import time
 from pathlib import Path
 
+from thermoctl.configuration.settings import Settings, load_rig
 from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
-from thermoctl.daemon.loop import die_with_parent
-from thermoctl.settings import Settings, load_rig
+from thermoctl.daemon.tick.loop import die_with_parent
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 

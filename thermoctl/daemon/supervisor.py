@@ -24,10 +24,9 @@ import socket
 import time
 from functools import partial
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
-from thermoctl.daemon import loop as loops
-from thermoctl.daemon.assemble import check_mode, compensator, law_parameters, shared_name
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.journal import Log, Watcher, console_log
 from thermoctl.daemon.lock import hold
@@ -40,8 +39,9 @@ from thermoctl.daemon.processes import (
     make_children,
     restart,
 )
-from thermoctl.daemon.shared import LOOP_PID, Shared
-from thermoctl.settings import Settings
+from thermoctl.daemon.tick import loop as loops
+from thermoctl.daemon.tick.assemble import check_mode, compensator, law_parameters, shared_name
+from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import HardwareError
 from thermoctl_hal.make import disable_amplifier

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import AT as CHANNEL_AT
-from thermoctl.channels import DEFAULT, Channels
+from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.shared import TUNING, Shared
+from thermoctl.daemon.tick.shared import TUNING, Shared
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
-from thermoctl.settings import Settings
-from thermoctl.signals import AT, of_channels
+from thermoctl.rig.channels import AT as CHANNEL_AT
+from thermoctl.rig.channels import DEFAULT, Channels
+from thermoctl.rig.signals import AT, of_channels
 from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5

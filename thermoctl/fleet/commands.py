@@ -15,6 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from thermoctl.configuration.settings import load_settings
 from thermoctl.fleet import live
 from thermoctl.fleet.health import Summary, summarise
 from thermoctl.fleet.laws import comparisons, side_by_side
@@ -23,7 +24,6 @@ from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
 from thermoctl.proof.jobs import Job, outcome
 from thermoctl.proof.run import Reporter, cluster, run_all
-from thermoctl.settings import load_settings
 from thermoctl.yamlfile import InputError, suggest
 
 

@@ -22,7 +22,7 @@ from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.signals import join_fault_words
+from thermoctl.rig.signals import join_fault_words
 from thermoctl.yamlfile import InputError
 
 ROWS = 4000  # a longer recording is thinned to about this many rows before a fit

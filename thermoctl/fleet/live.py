@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.daemon.assemble import compensator
+from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.misfit import Alarm, Misfit
+from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.plant.language import Plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 BEFORE_S = 1800.0  # length of the part before the alarm, when the model still fitted

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import DEFAULT, points_of_file
 from thermoctl.identify import linearise as thermal_model
 from thermoctl.identify.modelfile import save_model
 from thermoctl.plant import load
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
+from thermoctl.rig.channels import DEFAULT, points_of_file
 
 
 def linearise(args: argparse.Namespace) -> int:

@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.signals import AT, fault_word
+from thermoctl.rig.signals import AT, fault_word
 from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
@@ -302,7 +302,7 @@ class Aborted(Exception):
 
 
 class ScheduleTarget(Protocol):
-    """A rig that runs a schedule: `daemon.simulate.Simulation`, or another with the same methods."""
+    """A rig that runs a schedule: `daemon.offline.simulate.Simulation`, or another with the same methods."""
 
     @property
     def row(self) -> np.ndarray:

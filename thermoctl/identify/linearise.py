@@ -23,10 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from thermoctl.channels import DEFAULT, Channels
 from thermoctl.control.model import CompensatorModel
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Output, Plant
+from thermoctl.rig.channels import DEFAULT, Channels
 from thermoctl.yamlfile import InputError
 
 AIR, VOLTAGE, CURRENT, POWER, ERROR = "air_c", "voltage_v", "current_a", "power_w", "position_error_um"

@@ -16,7 +16,7 @@ import numpy as np
 
 from thermoctl.extras import load
 from thermoctl.recording.table import Table
-from thermoctl.signals import units
+from thermoctl.rig.signals import units
 from thermoctl.yamlfile import InputError
 
 

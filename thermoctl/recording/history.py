@@ -19,7 +19,7 @@ import numpy as np
 
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
-from thermoctl.signals import NAMES
+from thermoctl.rig.signals import NAMES
 from thermoctl.yamlfile import InputError, suggest
 
 Invalid = Callable[[Mapping[str, np.ndarray], Mapping[str, str], str], np.ndarray] | None

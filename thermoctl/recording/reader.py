@@ -18,7 +18,7 @@ import pyarrow.parquet
 from thermoctl.recording import formats
 from thermoctl.recording.files import read_table, to_arrow, whole_file
 from thermoctl.recording.stream import END, open_stream
-from thermoctl.signals import of_recording
+from thermoctl.rig.signals import of_recording
 from thermoctl.yamlfile import InputError, suggest
 
 

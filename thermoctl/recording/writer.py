@@ -25,7 +25,7 @@ import numpy as np
 import pyarrow as pa
 
 from thermoctl.recording.stream import CRC, END, checksums
-from thermoctl.signals import SIGNALS, Signal
+from thermoctl.rig.signals import SIGNALS, Signal
 
 BATCH_S = 0.5  # of ticks in one batch of the full rate; a power loss costs at most this
 BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster

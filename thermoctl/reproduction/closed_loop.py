@@ -20,16 +20,16 @@ from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.recorded import Recorded, of_columns
 from thermoctl.calibration.schedules import of_config
 from thermoctl.calibration.simulated_rig import with_model
+from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.simulate import Simulation
+from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.identify import experiments
 from thermoctl.plant import extended
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.reproduction.plants import HEATED, quasi_static
 from thermoctl.reproduction.rigs import PAPER_SCALE
-from thermoctl.settings import load_settings
-from thermoctl.signals import INDEX, NAMES, POINTS
+from thermoctl.rig.signals import INDEX, NAMES, POINTS
 
 
 def of_rows(rows: np.ndarray) -> Recorded:

@@ -14,7 +14,7 @@ from thermoctl.calibration.schedules import CUTOFF_HZ
 from thermoctl.identify import experiments
 from thermoctl.report.page import figure
 from thermoctl.reproduction.seeds import Kept
-from thermoctl.signals import POINTS
+from thermoctl.rig.signals import POINTS
 
 SHOWN = (0, 2, 5, 8, 10)  # points whose rises are drawn
 REACHED = 1 - np.exp(-1)  # share of a first-order step after one time constant

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from thermoctl.plant import Plant, from_plain
-from thermoctl.signals import POINTS
+from thermoctl.rig.signals import POINTS
 
 HEATED = ("inner_magnet", "outer_stator", "bracket_1")  # bodies with unmeasured heat
 FAST = ("i_coil", "u_integral", "velocity", "position")  # states that settle in milliseconds

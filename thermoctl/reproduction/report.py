@@ -14,7 +14,7 @@ from thermoctl.reproduction import rigs, tables
 from thermoctl.reproduction.figures import figures
 from thermoctl.reproduction.goals import Goal, Limit
 from thermoctl.reproduction.seeds import Kept, MeanTwoS, SeedResult
-from thermoctl.signals import POINTS
+from thermoctl.rig.signals import POINTS
 
 Section = tuple[str, str]
 ESTIMATORS = {

@@ -26,7 +26,7 @@ from thermoctl.plant import Plant
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.reproduction.plants import HEATED, hidden_masses, quasi_static
-from thermoctl.signals import POINTS
+from thermoctl.rig.signals import POINTS
 
 PAPER_SCALE = {
     "a_bobbin": 1.5,

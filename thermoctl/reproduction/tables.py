@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.signals import POINTS
+from thermoctl.rig.signals import POINTS
 
 ZETA = (1, 0.763, 0.729, 0.495, 0.353, 0.264, 0.148, 0.312, 0.185, 0.131, 0.372, 0.661)
 TABLE_V = (

@@ -4,7 +4,7 @@ from libc.stdint cimport int64_t
 from libc.string cimport memcpy
 
 from thermoctl.control.law cimport Law
-from thermoctl.daemon.clock cimport now_ns
+from thermoctl.daemon.tick.clock cimport now_ns
 
 
 cdef class Probe:

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.daemon import loop, supervisor
-from thermoctl.settings import load_settings
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon import supervisor
+from thermoctl.daemon.tick import loop
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "build/bench-realtime"))
 from batch import Probe  # noqa: E402

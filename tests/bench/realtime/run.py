@@ -249,11 +249,11 @@ def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
 
 def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
     """The daemon for `seconds` after it is ready; rows from its own ring, ends of ticks from the probe."""
-    from thermoctl.daemon.assemble import shared_name
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.daemon.control_socket import ask
-    from thermoctl.daemon.shared import START_S, Shared
-    from thermoctl.settings import load_settings
-    from thermoctl.signals import INDEX
+    from thermoctl.daemon.tick.assemble import shared_name
+    from thermoctl.daemon.tick.shared import START_S, Shared
+    from thermoctl.rig.signals import INDEX
     from thermoctl.yamlfile import InputError
 
     settings = load_settings(bench.config)
@@ -343,9 +343,9 @@ def processes(pid: int) -> dict[str, int]:
 
 def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
     """Model and parameters in the order that law_load of law.c takes them."""
-    from thermoctl.channels import COIL
     from thermoctl.control import faults
     from thermoctl.control.law import MAX_AVERAGE
+    from thermoctl.rig.channels import COIL
 
     trip_others = faults.mask("fault", "critical", readings=False)
     first = model.A_minus_I[0].copy()
@@ -432,7 +432,7 @@ def law_numbers(model: Any, parameters: Any, period_s: float) -> np.ndarray:
 
 def readings(ticks: int, seed: int = 7) -> dict[str, np.ndarray]:
     """Readings of a warm day in the paper's motion, with the encoder's missing frames and now and then a bad reading."""
-    from thermoctl.channels import AMP_DISABLED, AMP_ENABLED, CHANNELS
+    from thermoctl.rig.channels import AMP_DISABLED, AMP_ENABLED, CHANNELS
 
     rng = np.random.default_rng(seed)
     n = len(CHANNELS)
@@ -475,9 +475,9 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
     import Cython.Build
     import setuptools
 
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.control.law import COMPILED, OUTPUTS, Law
-    from thermoctl.daemon.assemble import compensator, law_parameters
-    from thermoctl.settings import load_settings
+    from thermoctl.daemon.tick.assemble import compensator, law_parameters
 
     if not COMPILED:
         raise SystemExit("the law is not compiled: make install")

@@ -61,13 +61,13 @@ def configuration(work: Path) -> Path:
 
 def simulated(work: Path, hours: float) -> list[Sample]:
     """A sample every five minutes of simulated time."""
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.daemon import keep
     from thermoctl.daemon.command_server import Commands
     from thermoctl.daemon.journal import Watcher
+    from thermoctl.daemon.offline.simulate import Simulation
     from thermoctl.daemon.recorder import make_recorder
-    from thermoctl.daemon.shared import Shared
-    from thermoctl.daemon.simulate import Simulation
-    from thermoctl.settings import load_settings
+    from thermoctl.daemon.tick.shared import Shared
 
     def silent(*_: Any, **__: Any) -> None:
         pass
@@ -103,7 +103,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
 
 def drivers(bench: Bench, ticks: int) -> list[Sample]:
     """A sample every twentieth of the ticks."""
-    from thermoctl.settings import load_settings
+    from thermoctl.configuration.settings import load_settings
     from thermoctl_hal.make import make_backend
 
     backend = make_backend(load_settings(bench.config))
@@ -122,8 +122,8 @@ def drivers(bench: Bench, ticks: int) -> list[Sample]:
 
 def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
     """A sample of each process every two seconds, from the tenth second on."""
+    from thermoctl.configuration.settings import load_settings
     from thermoctl.daemon.control_socket import ask
-    from thermoctl.settings import load_settings
     from thermoctl.yamlfile import InputError
 
     config = configuration(work)

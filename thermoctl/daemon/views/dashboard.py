@@ -39,18 +39,18 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from thermoctl.channels import DEFAULT
-from thermoctl.daemon.access import MIN_TOKEN, Policy, Refused, parse_address
-from thermoctl.daemon.assemble import rig_identity
+from thermoctl.configuration.settings import Settings
+from thermoctl.daemon.answers.readings import hide_invalid, invalid
+from thermoctl.daemon.answers.sources import sources
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.metrics import CONTENT_TYPE, metrics
-from thermoctl.daemon.readings import hide_invalid, invalid
-from thermoctl.daemon.sources import sources
-from thermoctl.daemon.watch import Watch
+from thermoctl.daemon.tick.assemble import rig_identity
+from thermoctl.daemon.views.access import MIN_TOKEN, Policy, Refused, parse_address
+from thermoctl.daemon.views.metrics import CONTENT_TYPE, metrics
+from thermoctl.daemon.views.watch import Watch
 from thermoctl.recording.history import history
-from thermoctl.settings import Settings
+from thermoctl.rig.channels import DEFAULT
+from thermoctl.rig.signals import AT
 from thermoctl.shipped import shipped
-from thermoctl.signals import AT
 from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import ERROR, STALE, STATUS_NAMES, Channels
 from thermoctl.control import causes, faults
-from thermoctl.daemon.ring import CODE, CODE_S, TRIPS
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.sources import sources
-from thermoctl.signals import AT, Row, fault_word, of_recording, recorded_states
+from thermoctl.daemon.answers.sources import sources
+from thermoctl.daemon.tick.ring import CODE, CODE_S, TRIPS
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.rig.channels import ERROR, STALE, STATUS_NAMES, Channels
+from thermoctl.rig.signals import AT, Row, fault_word, of_recording, recorded_states
 from thermoctl_hal.drive_errors import describe
 
 

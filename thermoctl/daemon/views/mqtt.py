@@ -17,9 +17,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.control_socket import ask
 from thermoctl.extras import load
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 CONNECT_S = 10.0

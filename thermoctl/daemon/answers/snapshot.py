@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import STATUS_NAMES
 from thermoctl.control import arming
-from thermoctl.daemon import readings
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
-from thermoctl.signals import AT, Row
+from thermoctl.daemon.answers import readings
+from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
+from thermoctl.rig.channels import STATUS_NAMES
+from thermoctl.rig.signals import AT, Row
 
 NUMBERS = (
     "setpoint_um",

@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermoctl.daemon.arrival import expected_hz, slow
-from thermoctl.daemon.assemble import check_mode, compensator, lacks, law_parameters, power_warning
+from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.lock import holder
-from thermoctl.daemon.loop import become_real_time
-from thermoctl.settings import Settings
+from thermoctl.daemon.tick.arrival import expected_hz, slow
+from thermoctl.daemon.tick.assemble import check_mode, compensator, lacks, law_parameters, power_warning
+from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
 from thermoctl_hal.latency_timer import latency_timer_ms

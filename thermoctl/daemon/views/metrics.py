@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.daemon.readings import readings, valid_signals
-from thermoctl.daemon.shared import RECORDER_LOST, RECORDER_ROWS, Shared
-from thermoctl.signals import AT, Row, fault_word
+from thermoctl.daemon.answers.readings import readings, valid_signals
+from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, Shared
+from thermoctl.rig.signals import AT, Row, fault_word
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 4096)

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
-from thermoctl.daemon.assemble import compensator, law_parameters
-from thermoctl.daemon.loop import RELOAD, Rig
-from thermoctl.daemon.ring import Box, Mailbox
-from thermoctl.settings import Settings
-from thermoctl.signals import AT, fault_word
+from thermoctl.daemon.tick.assemble import compensator, law_parameters
+from thermoctl.daemon.tick.loop import RELOAD, Rig
+from thermoctl.daemon.tick.ring import Box, Mailbox
+from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.make import make_backend
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}

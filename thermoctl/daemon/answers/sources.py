@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.channels import FIXED, Channels
+from thermoctl.rig.channels import FIXED, Channels
 
 FIXED_SOURCES: dict[str, tuple[str, ...]] = {
     **{c.signal: (c.role,) for c in FIXED},

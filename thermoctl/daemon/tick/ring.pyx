@@ -14,8 +14,8 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from thermoctl.channels import AT
-from thermoctl.signals import DELAYS_PER_WORD, FRESH_PER_WORD, OUTPUTS, STATUS_PER_WORD
+from thermoctl.rig.channels import AT
+from thermoctl.rig.signals import DELAYS_PER_WORD, FRESH_PER_WORD, OUTPUTS, STATUS_PER_WORD
 
 # The air and the points have their delay recorded. All words hold at most 52 bits, exact in a float64.
 cdef int FIRST_DELAYED = AT["air_c"], OUTPUTS_OF_EVERY_RIG = len(OUTPUTS)

@@ -21,17 +21,17 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import AT, DEFAULT, Channels
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
 from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.arrival import put_counters
-from thermoctl.daemon.clock import now_ns, sleep_until, suspended_ns, wall_s
-from thermoctl.daemon.ring import Mailbox, Record, Remarks, Ring
-from thermoctl.daemon.shared import LOOP_PID, START_S, Shared
-from thermoctl.settings import Settings
-from thermoctl.signals import AT as SIGNAL_AT
-from thermoctl.signals import of_channels
+from thermoctl.daemon.tick.arrival import put_counters
+from thermoctl.daemon.tick.clock import now_ns, sleep_until, suspended_ns, wall_s
+from thermoctl.daemon.tick.ring import Mailbox, Record, Remarks, Ring
+from thermoctl.daemon.tick.shared import LOOP_PID, START_S, Shared
+from thermoctl.rig.channels import AT, DEFAULT, Channels
+from thermoctl.rig.signals import AT as SIGNAL_AT
+from thermoctl.rig.signals import of_channels
 from thermoctl_hal.backend import ABSENT
 from thermoctl_hal.devices import DevicesBackend
 

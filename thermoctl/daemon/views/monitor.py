@@ -17,9 +17,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from thermoctl.configuration.settings import Settings
+from thermoctl.daemon.answers.display import fault_lines, message_lines, number, span
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.display import fault_lines, message_lines, number, span
-from thermoctl.settings import Settings
 from thermoctl.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"

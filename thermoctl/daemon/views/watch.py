@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.assemble import compensator, shared_name
-from thermoctl.daemon.readings import hide_invalid
-from thermoctl.daemon.shared import Shared
-from thermoctl.daemon.snapshot import latency, status
-from thermoctl.settings import Settings
-from thermoctl.signals import AT, fault_words
+from thermoctl.daemon.answers.readings import hide_invalid
+from thermoctl.daemon.answers.snapshot import latency, status
+from thermoctl.daemon.tick.assemble import compensator, shared_name
+from thermoctl.daemon.tick.shared import Shared
+from thermoctl.rig.signals import AT, fault_words
 from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # span of a capture before and after the fault

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thermoctl.daemon.shared import COUNTER_WORDS, Shared
-from thermoctl.settings import Settings
-from thermoctl.signals import AT
+from thermoctl.configuration.settings import Settings
+from thermoctl.daemon.tick.shared import COUNTER_WORDS, Shared
+from thermoctl.rig.signals import AT
 
 SLOW_SHARE = (
     0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3

@@ -25,13 +25,13 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from thermoctl.configuration.settings import Settings, effective, load_settings
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.dashboard import make_server, url
 from thermoctl.daemon.lock import holder
-from thermoctl.daemon.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.service import START_S, STOP_S, Background
-from thermoctl.daemon.watch import Watch
-from thermoctl.settings import Settings, effective, load_settings
+from thermoctl.daemon.views.dashboard import make_server, url
+from thermoctl.daemon.views.monitor import errors, ramp_of, remember, screen
+from thermoctl.daemon.views.watch import Watch
 from thermoctl.shipped import state_folder
 from thermoctl.yamlfile import InputError
 

@@ -26,11 +26,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import DEFAULT, Channels, of_text
 from thermoctl.control import faults
 from thermoctl.control.model import packed_names
-from thermoctl.daemon.ring import Box, Histogram, Mailbox, Remarks, Ring
-from thermoctl.signals import Row, of_channels
+from thermoctl.daemon.tick.ring import Box, Histogram, Mailbox, Remarks, Ring
+from thermoctl.rig.channels import DEFAULT, Channels, of_text
+from thermoctl.rig.signals import Row, of_channels
 from thermoctl.yamlfile import InputError
 
 VERSION = 2

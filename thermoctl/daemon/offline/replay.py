@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.channels import of_names
 from thermoctl.control.law import Law
 from thermoctl.daemon.recorder import read_law_metadata
-from thermoctl.daemon.ring import unpack_readings
+from thermoctl.daemon.tick.ring import unpack_readings
 from thermoctl.recording.reader import info, read_rows
-from thermoctl.signals import AT, OUTPUTS, of_channels
+from thermoctl.rig.channels import of_names
+from thermoctl.rig.signals import AT, OUTPUTS, of_channels
 from thermoctl.yamlfile import InputError
 
 _DT, _COMMAND, _VALUE, _EXTERNAL = (AT[n] for n in ("dt_s", "command", "command_value", "external_bits"))

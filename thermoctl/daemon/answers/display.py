@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from thermoctl.daemon.sources import FIXED_SOURCES
+from thermoctl.daemon.answers.sources import FIXED_SOURCES
 
 LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
 _NORMAL = ("frames", "rows")  # counters of devices that count what is well

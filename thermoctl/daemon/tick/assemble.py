@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.channels import Channels
+from thermoctl.configuration.settings import RigSettings, Settings
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
-from thermoctl.settings import RigSettings, Settings
+from thermoctl.rig.channels import Channels
 from thermoctl.yamlfile import InputError, load
 from thermoctl_hal.binding import bind
 

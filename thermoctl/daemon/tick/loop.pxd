@@ -3,8 +3,8 @@ cimport cython
 from libc.stdint cimport uint8_t
 from thermoctl_hal.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
-from thermoctl.daemon.clock cimport now_ns, sleep_until, suspended_ns, wall_s
-from thermoctl.daemon.ring cimport Histogram, Mailbox, Record, Remarks, Ring
+from thermoctl.daemon.tick.clock cimport now_ns, sleep_until, suspended_ns, wall_s
+from thermoctl.daemon.tick.ring cimport Histogram, Mailbox, Record, Remarks, Ring
 
 cdef unsigned long long _OTHER_AXIS, _OWN_FAULTS
 cdef int _FAULT, _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _LATEST, _OFF, _STATE, _CODE, _ABSENT

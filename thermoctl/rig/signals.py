@@ -20,7 +20,7 @@ from math import inf
 
 import numpy as np
 
-from thermoctl.channels import COIL, DEFAULT, FIXED, STATUS_NAMES, Channels, of_text
+from thermoctl.rig.channels import COIL, DEFAULT, FIXED, STATUS_NAMES, Channels, of_text
 
 FAULT_WORD_BITS = 53
 """A float64 holds 53 bits exactly: the faults from this bit on are in `fault_bits_2`."""

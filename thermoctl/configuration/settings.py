@@ -22,10 +22,18 @@ from typing import Any
 
 import yaml
 
-from thermoctl.channels import CODES, DEFAULT, AxesChannels, Channels, Point, read_points, read_shared_points
 from thermoctl.control.limits import Limits
-from thermoctl.option import Option, option
-from thermoctl.signals import Row, of_channels
+from thermoctl.rig.channels import (
+    CODES,
+    DEFAULT,
+    AxesChannels,
+    Channels,
+    Point,
+    read_points,
+    read_shared_points,
+)
+from thermoctl.rig.option import Option, option
+from thermoctl.rig.signals import Row, of_channels
 from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"

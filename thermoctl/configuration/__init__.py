@@ -1,0 +1,1 @@
+"""The typed configuration of a rig, and the rule by which a command finds its file."""

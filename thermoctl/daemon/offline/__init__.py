@@ -1,0 +1,1 @@
+"""The rig without a daemon: doctor, simulated time and replay."""

@@ -1,0 +1,1 @@
+"""Views for people: dashboard, monitor, metrics, MQTT and the demo."""
