@@ -1,7 +1,7 @@
 """The import graph of thermoctl and thermoctl_hal, read from the source: `python -m tests.architecture` prints it.
 
 Every import counts: at the top of a module, inside a function, under TYPE_CHECKING, and `cimport` in Cython sources.
-So does a function that a row of thermoctl/commands.py names as text, "module:function".
+So does a function that a row of a table of commands names as text, "module:function".
 """
 
 from __future__ import annotations

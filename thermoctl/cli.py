@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 
 from thermoctl import __version__
-from thermoctl.commands import AXIS, COMMANDS, GROUPS, call, takes_axis
+from thermoctl.command import AXIS
+from thermoctl.commands import BY_PURPOSE, COMMANDS, GROUPS, call, takes_axis
 from thermoctl.configuration import which_rig
 from thermoctl.extras import lacking
 from thermoctl.yamlfile import InputError
@@ -24,31 +27,97 @@ lacks when it disagrees with a recording.
 
 Exit status: 0 done; 1 the answer is no (a check failed, the daemon is not running, a fault is active); 2 unusable input
 (one line on stderr says what, where, what was expected); 3 the hardware or the system refused; 130 interrupted."""
+_NAME_WIDTH = 14  # columns of a command's name in `thermoctl --help`
+_WIDTH = 110
+
+
+class _Top(argparse.ArgumentParser):
+    """The parser of the whole command line: its help lists the commands by purpose."""
+
+    def format_help(self) -> str:
+        """Return the help: usage, description, and the commands by what a user wants."""
+        parts = [
+            self.format_usage(),
+            DESCRIPTION,
+            "  --version  show the version\n  -h, --help  show this help",
+        ]
+        for purpose, rows in BY_PURPOSE.items():
+            helps = {group: GROUPS.get(group, row.help) for row in rows for group in (row.name.split()[0],)}
+            lines = "\n".join(_listed(name, text) for name, text in helps.items())
+            parts.append(f"{purpose}:\n{lines}")
+        return "\n\n".join(p.rstrip() for p in parts) + "\n\n`thermoctl COMMAND --help` shows its options.\n"
+
+
+def _listed(name: str, text: str) -> str:
+    return textwrap.fill(
+        text, _WIDTH, initial_indent=f"  {name:<{_NAME_WIDTH}}", subsequent_indent=" " * (_NAME_WIDTH + 2)
+    )
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the whole command line (also read by the completions and by the reference page)."""
-    top = argparse.ArgumentParser(
-        prog="thermoctl", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    top = _Top(
+        prog="thermoctl",
+        usage="thermoctl COMMAND ...",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"thermoctl {__version__}")
-    levels = {"": top.add_subparsers(metavar="COMMAND", dest="command", required=True)}
+    kind = argparse.ArgumentParser
+    levels = {"": top.add_subparsers(metavar="COMMAND", dest="command", required=True, parser_class=kind)}
     for command in COMMANDS:
         group, _, name = command.name.rpartition(" ")
         if group not in levels:
-            below = levels[""].add_parser(group, help=GROUPS[group])
+            below = levels[""].add_parser(group, help=GROUPS[group], prog=f"thermoctl {group}")
             levels[group] = below.add_subparsers(metavar="WHAT", required=True)
-        own = levels[group].add_parser(name, help=command.help, description=command.help)
+        own = levels[group].add_parser(
+            name, help=command.help, description=command.help, prog=f"thermoctl {command.name}"
+        )
         for argument in (*command.arguments, *((AXIS,) if takes_axis(command) else ())):
             own.add_argument(*argument.flags, **argument.options)
-        own.set_defaults(row=command)
+        own.set_defaults(row=command, own=own)
     return top
+
+
+def _below(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+    """Return the parsers of the commands below a parser, by name."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return action.choices
+    return {}
+
+
+def _similar(word: str, named: Mapping[str, str]) -> str:
+    """Return "; did you mean 'NAME'?" for the names whose value is nearest to `word`, or nothing."""
+    near = difflib.get_close_matches(word, set(named.values()), 1, 0.6)
+    meant = [f"'{name}'" for name, last in named.items() if last in near]
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
+
+
+def _parsed(top: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
+    """Return the parsed arguments.
+
+    Raises SystemExit(2) for a mistake, with the usage of the command in which it was made."""
+    at, rest = top, list(words)
+    while rest and (below := _below(at)) and not rest[0].startswith("-"):
+        if rest[0] not in below:
+            named = {below[name].prog: name for name in below}
+            if not _similar(rest[0], named) or at is top:
+                named |= {f"thermoctl {row.name}": row.name.split()[-1] for row in COMMANDS}
+            at.error(f"unknown command '{rest[0]}'{_similar(rest[0], named)}")
+        at = below[rest.pop(0)]
+    if not rest and (below := _below(at)):
+        at.error(f"a command was expected: {', '.join(below)} (see `{at.prog} --help`)")
+    args, more = top.parse_known_args(words, argparse.Namespace(parser=top))
+    if more:
+        flags = {flag: flag for action in args.own._actions for flag in action.option_strings}
+        args.own.error(f"unrecognized arguments: {' '.join(more)}{_similar(more[0].split('=')[0], flags)}")
+    return args
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status."""
-    top = parser()
-    args = top.parse_args(argv, argparse.Namespace(parser=top))
+    args = _parsed(parser(), sys.argv[1:] if argv is None else argv)
     try:
         which_rig.choose(args)
         return call(args.row, args)

@@ -1,0 +1,77 @@
+"""The command line: commands by purpose, and mistakes answered by the command in which they were made."""
+
+import subprocess
+import sys
+
+import pytest
+
+from thermoctl import cli
+from thermoctl.command import PURPOSES
+from thermoctl.commands import COMMANDS
+
+
+def refused(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words)
+    assert ended.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_the_help_lists_every_command_once_below_its_purpose(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    places = [text.index(f"\n{purpose}:\n") for purpose in PURPOSES]
+    assert places == sorted(places)
+    for name in {row.name.split()[0] for row in COMMANDS}:
+        assert text.count(f"\n  {name} ") == 1, name
+    assert max(map(len, text.splitlines())) <= 120
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("chek", "thermoctl check"),
+        ("staus", "thermoctl status"),
+        ("diagnoze x", "thermoctl diagnose"),
+        ("recording list", "thermoctl recordings"),
+        ("plant chekc p.yaml", "thermoctl plant check"),
+        ("device list", "thermoctl devices"),
+        ("export p.yaml", "thermoctl recordings export' or 'thermoctl plant export"),
+        ("plant simulate", "thermoctl simulate"),
+        ("linearize", "thermoctl plant linearise"),
+    ],
+)
+def test_an_unknown_command_names_the_nearest(words, meant, capsys):
+    assert f"did you mean '{meant}" in refused(capsys, *words.split())
+
+
+def test_what_resembles_no_command_gets_no_guess(capsys):
+    error = refused(capsys, "xyzzy")
+    assert "unknown command 'xyzzy'" in error and "did you mean" not in error
+
+
+@pytest.mark.parametrize(
+    ("words", "usage", "says"),
+    [
+        ("model list --config F", "usage: thermoctl model ", "unrecognized arguments: --config F"),
+        ("plant", "usage: thermoctl plant ", "new, "),
+        ("plant zzz", "usage: thermoctl plant ", "unknown command 'zzz'"),
+        ("setpoint", "usage: thermoctl setpoint ", "VALUE_UM"),
+        ("diagnose --heldout x", "usage: thermoctl diagnose ", "did you mean '--held-out'?"),
+        ("recordings import a --out b --tim t --x", "usage: thermoctl recordings import ", "--x"),
+    ],
+)
+def test_a_mistake_shows_the_usage_of_its_own_command(words, usage, says, capsys):
+    error = refused(capsys, *words.split())
+    assert error.startswith(usage) and says in error
+
+
+def test_the_command_line_alone_loads_no_package():
+    """`thermoctl --help` reads the tables of commands and nothing that they name."""
+    code = "import sys, thermoctl.cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not {"numpy", "scipy", "pint", "rich", "thermoctl.settings", "thermoctl.plant.files"} & set(
+        loaded.split()
+    )

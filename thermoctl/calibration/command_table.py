@@ -1,0 +1,99 @@
+"""Rows of the command table: calibrations."""
+
+from __future__ import annotations
+
+from thermoctl.command import CALIBRATE, CONFIG, MODELS, ORDER, YES, Table, argument, command
+
+TABLE: Table = {
+    CALIBRATE: (
+        command(
+            "calibrate",
+            "doctor, step, PID, tests, model and proof in one guided run; continues where it was ended; writes only into its "
+            "folder until it is accepted",
+            "thermoctl.calibration.commands:calibrate",
+            "config out models order gains accept again yes",
+            CONFIG,
+            argument("--out", metavar="DIR", help="the calibration's folder (default calibration/RIG)"),
+            MODELS,
+            ORDER,
+            argument("--gains", action="store_true", help="on acceptance also write the proposed PID gains"),
+            argument("--accept", action="store_true", help="install the model when the proof is done"),
+            argument("--again", action="store_true", help="discard an earlier run in the folder"),
+            YES,
+        ),
+        command(
+            "tune",
+            "propose PID gains from the closed loop's response to setpoint ramps of a few um; asks, then arms the rig with "
+            "all protections",
+            "thermoctl.calibration.commands:tune",
+            "config method write yes",
+            CONFIG,
+            argument(
+                "--method",
+                choices=("imc", "zn"),
+                default="imc",
+                help="imc: lambda tuning with a phase margin of 45 deg and a gain margin of 2 (default); "
+                "zn: Ziegler-Nichols, Table I of the paper",
+            ),
+            argument("--write", action="store_true", help="write the proposal into the configuration"),
+            YES,
+        ),
+        command(
+            "experiment",
+            "run and record a test of experiments.yaml, or an experiment file such as a diagnosis proposes",
+            "thermoctl.calibration.commands:run_experiment",
+            "name config out dry_run resume plant yes",
+            argument(
+                "name", metavar="NAME|FILE", help="a test of experiments.yaml, or a file with one experiment"
+            ),
+            CONFIG,
+            argument(
+                "--plant",
+                metavar="PLANT",
+                help="simulate this plant file instead of the rig, for inputs that the daemon cannot drive",
+            ),
+            argument(
+                "--out", metavar="FILE", help="recording (.parquet, .csv, .arrow; default NAME.parquet)"
+            ),
+            argument(
+                "--dry-run", action="store_true", help="show schedule, power and spectrum; drive nothing"
+            ),
+            argument("--resume", action="store_true", help="continue an aborted recording"),
+            YES,
+        ),
+        command(
+            "identify",
+            "make a calibration from the recordings of tests 2, 3 and 4A, in the folder of calibrations",
+            "thermoctl.calibration.commands:identify",
+            "test_2 test_3 test_4a config models method order",
+            argument("test_2", metavar="TEST_2"),
+            argument("test_3", metavar="TEST_3"),
+            argument("test_4a", metavar="TEST_4A"),
+            CONFIG,
+            MODELS,
+            argument(
+                "--method",
+                choices=("better", "paper"),
+                default="better",
+                help="compensator: ours, or the paper's (default better)",
+            ),
+            ORDER,
+        ),
+        command(
+            "model",
+            "list, show or roll back calibrations",
+            "thermoctl.calibration.commands:model",
+            "action models name",
+            argument("action", choices=("list", "show", "rollback")),
+            argument("name", nargs="?", metavar="NAME"),
+            MODELS,
+        ),
+        command(
+            "evaluate",
+            "compute the ISO 230-2 figures of recordings with a reference encoder",
+            "thermoctl.calibration.commands:evaluate",
+            "recordings",
+            argument("recordings", nargs="+", metavar="RECORDING"),
+        ),
+    )
+}

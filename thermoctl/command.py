@@ -1,0 +1,96 @@
+"""A row of the command table: a command's name, help and arguments, and the function that does its work.
+
+Each package holds the rows of its own commands in `command_table.py`: `TABLE`, rows by purpose. A table
+imports nothing but this module, so that `thermoctl --help` loads no package. `commands` joins the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+RUN, LOOK, CALIBRATE = "run a rig", "look at a rig and its recordings", "calibrate a rig"
+MODEL, DIAGNOSE, MANY_RIGS, HELP = "model", "diagnose", "many rigs", "help"
+PURPOSES = (RUN, LOOK, CALIBRATE, MODEL, DIAGNOSE, MANY_RIGS, HELP)
+"""The purposes of commands, in the order of `thermoctl --help`."""
+
+
+class Argument(NamedTuple):
+    """One argument, as argparse's add_argument takes it."""
+
+    flags: tuple[str, ...]
+    options: Mapping[str, Any]
+
+
+class Command(NamedTuple):
+    """One command; a name of two words is a command below a group.
+
+    function: "module:function", imported when the command is given. takes: the arguments that the function
+    gets, in order, by the names that argparse gives them. `settings` stands for the configuration read from
+    --config, `parser` for the whole command line. Without any the function gets the namespace of all
+    arguments."""
+
+    name: str
+    help: str
+    function: str
+    takes: str
+    arguments: tuple[Argument, ...]
+
+
+Table = Mapping[str, tuple[Command, ...]]
+"""The rows of a package by purpose."""
+
+
+def argument(*flags: str, **options: Any) -> Argument:
+    """Return an argument with the flags and options of argparse's add_argument."""
+    return Argument(flags, options)
+
+
+def command(name: str, help: str, function: str, takes: str, *arguments: Argument) -> Command:
+    """Return a command's row."""
+    return Command(name, help, function, takes, arguments)
+
+
+CONFIG = argument(
+    "--config",
+    metavar="FILE",
+    help="configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
+)
+"""The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
+AXIS = argument("--axis", metavar="NAME", help="the axis of a rig with several")
+"""Goes with CONFIG, except for ALL_AXES (see `takes_axis`)."""
+FILE = argument("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
+YES = argument(
+    "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
+)
+JSON = argument("--json", action="store_true", help="print one JSON object, for programs")
+PLANT = argument("--plant", required=True, metavar="PLANT", help="the plant file, or an FMU")
+MAP = argument(
+    "--map",
+    metavar="FILE",
+    help="with an FMU as the plant: columns, roles, units, noise and ranges of its variables",
+)
+RECORDINGS = argument(
+    "recordings",
+    nargs="+",
+    metavar="REC",
+    help="recordings (.csv, .txt, .xlsx, .parquet, .arrow, .mf4, .tdms)",
+)
+TIME = argument(
+    "--time",
+    metavar="COLUMN",
+    help="the column of times (default: by its name, else the first that increases)",
+)
+COLUMNS = argument(
+    "--columns",
+    metavar="NAME=COLUMN,...",
+    help="names that the plant reads, and the recordings' columns that they stand for",
+)
+EFFECTS = argument(
+    "--effects", action="append", metavar="DIR", help="a further folder of effect files (repeatable)"
+)
+MODELS = argument(
+    "--models", metavar="DIR", help="folder of calibrations (default models; of an axis models/AXIS)"
+)
+ORDER = argument("--order", type=int, default=0, help="number of real poles (default 0: chosen by BIC)")
+ROOT = argument("--root", default="/", metavar="DIR", help="install below this directory")

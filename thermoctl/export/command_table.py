@@ -1,0 +1,35 @@
+"""Rows of the command table: plants for other programs."""
+
+from __future__ import annotations
+
+from thermoctl.command import COLUMNS, MODEL, TIME, Table, argument, command
+
+TABLE: Table = {
+    MODEL: (
+        command(
+            "plant export",
+            "write a plant for other programs: FMU, Modelica, Python, C, Simulink",
+            "thermoctl.export.commands:export",
+            "",
+            argument("plant", metavar="PLANT"),
+            argument(
+                "--to",
+                required=True,
+                choices=["fmu", "modelica", "python", "c", "simulink-m"],
+                help="the language",
+            ),
+            argument(
+                "--out",
+                metavar="FILE",
+                help="the file (default: the plant's name with the language's ending)",
+            ),
+            argument(
+                "--data",
+                metavar="REC",
+                help="a recording: first readings, this recording's parameters, and the widths of jumps",
+            ),
+            TIME,
+            COLUMNS,
+        ),
+    )
+}

@@ -1,0 +1,90 @@
+"""Rows of the command table: plant files."""
+
+from __future__ import annotations
+
+from thermoctl.command import COLUMNS, MAP, MODEL, PLANT, RECORDINGS, TIME, Table, argument, command
+
+TABLE: Table = {
+    MODEL: (
+        command(
+            "plant new",
+            "write a first plant file: from a recording of temperatures, or from a template",
+            "thermoctl.plant.new:new",
+            "",
+            argument("file", metavar="FILE", help="the plant file to write"),
+            argument(
+                "--from-csv",
+                metavar="REC",
+                help="a recording: one body for each thermometer, links to be confirmed",
+            ),
+            argument(
+                "--inputs",
+                metavar="A,B",
+                help="columns of inputs (default: powers, and the air's temperature)",
+            ),
+            argument("--outputs", metavar="A,B", help="columns of sensors (default: the other temperatures)"),
+            TIME,
+            COLUMNS,
+            argument(
+                "--template",
+                metavar="NAME",
+                help="block, motor, hot-end, room, tank, stage, flexure or actuator",
+            ),
+        ),
+        command(
+            "plant show",
+            "print a plant as tables, or draw its network",
+            "thermoctl.plant.commands:show",
+            "",
+            argument("plant", metavar="PLANT"),
+            argument("--out", metavar="FILE", help="draw to FILE.svg or FILE.png instead"),
+        ),
+        command(
+            "simulate",
+            "run a plant on recorded inputs and compare",
+            "thermoctl.plant.commands:simulate",
+            "",
+            PLANT,
+            MAP,
+            RECORDINGS,
+            TIME,
+            COLUMNS,
+            argument(
+                "--horizon",
+                type=float,
+                metavar="S",
+                help="predict at most S seconds ahead, re-initialised from the data",
+            ),
+            argument("--out", metavar="FILE", help="write time series (.csv, .parquet, .arrow)"),
+            argument("--plot", metavar="FILE", help="draw measured and simulated outputs (.png, .svg)"),
+        ),
+        command(
+            "refit",
+            "fit a plant's parameters to recordings, inside their ranges",
+            "thermoctl.plant.commands:refit",
+            "",
+            PLANT,
+            MAP,
+            RECORDINGS,
+            TIME,
+            COLUMNS,
+            argument("--out", metavar="PLANT2", help="write the refitted plant"),
+            argument(
+                "--held-out", nargs="+", metavar="REC", help="recordings for validation; not used in the fit"
+            ),
+            argument(
+                "--noise",
+                choices=["white", "ar1"],
+                default="white",
+                help="noise model (default white; ar1 is estimated)",
+            ),
+            argument(
+                "--tries",
+                type=int,
+                default=0,
+                metavar="N",
+                help="random starting points in the ranges (default 0)",
+            ),
+        ),
+    )
+}

@@ -1,0 +1,337 @@
+"""Commands that join the work of two packages, and commands of the root's modules: rows and functions."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from thermoctl.command import (
+    COLUMNS,
+    CONFIG,
+    DIAGNOSE,
+    EFFECTS,
+    HELP,
+    MAP,
+    ROOT,
+    RUN,
+    TIME,
+    YES,
+    Table,
+    argument,
+    command,
+)
+
+TABLE: Table = {
+    RUN: (
+        command(
+            "run",
+            "run the daemon in the foreground (as systemd does), or its tick in simulated time",
+            "thermoctl.root_commands:run",
+            "",
+            CONFIG,
+            argument(
+                "--simulated-time", action="store_true", help="run the simulated rig as fast as possible"
+            ),
+            argument("--hours", type=float, metavar="H", help="hours of rig time (with --simulated-time)"),
+            argument(
+                "--no-compensation",
+                action="store_true",
+                help="switch compensation off (with --simulated-time)",
+            ),
+            argument(
+                "--out", metavar="FILE", help="write 10 rows a second as Parquet (with --simulated-time)"
+            ),
+        ),
+        command(
+            "virtual-rig",
+            "simulate the devices of a configuration at the other end of their wires, in real time",
+            "thermoctl.root_commands:virtual_rig",
+            "settings tell",
+            CONFIG,
+            argument(
+                "--tell",
+                metavar="LINE",
+                default="",
+                help="inject a fault into the running virtual rig, or clear it, as 'encoder unplug' ('help' lists all)",
+            ),
+        ),
+        command(
+            "service",
+            "install or remove the systemd unit, its user, its device rules, the manual page and the shell completions",
+            "thermoctl.root_commands:service",
+            "",
+            argument("action", choices=["install", "uninstall"]),
+            CONFIG,
+            ROOT,
+        ),
+    ),
+    DIAGNOSE: (
+        command(
+            "diagnose",
+            "find where simulation and recordings differ, which physics is missing, and what adding it gains",
+            "thermoctl.root_commands:diagnose",
+            "",
+            argument(
+                "recordings",
+                nargs="*",
+                metavar="REC",
+                help="recordings (.csv, .xlsx, .parquet, .arrow) or patterns of them ('runs/*.csv'), or folders of many rigs' "
+                "recordings: one diagnosis a rig",
+            ),
+            argument(
+                "--together",
+                action="store_true",
+                help="with folders: all recordings in them are of one rig, for one diagnosis",
+            ),
+            argument("--plant", metavar="FILE", help="the plant file, or an FMU"),
+            MAP,
+            argument(
+                "--held-out",
+                action="append",
+                metavar="REC",
+                help="recording that takes no part in any choice and measures what the findings are worth (repeatable; "
+                "default: the last of three or more)",
+            ),
+            TIME,
+            COLUMNS,
+            argument(
+                "--anyway",
+                action="store_true",
+                help="diagnose although the checks of the data found a severe fault",
+            ),
+            argument(
+                "--out",
+                metavar="DIR",
+                help="folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)",
+            ),
+            argument(
+                "--continue",
+                dest="continued",
+                metavar="DIR",
+                help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
+            ),
+            argument(
+                "--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"
+            ),
+            argument(
+                "--last",
+                type=int,
+                default=2,
+                metavar="N",
+                help="with folders: use each rig's newest N recordings (default 2)",
+            ),
+            argument(
+                "--workers", type=int, metavar="N", help="with folders: local processes (default one a core)"
+            ),
+            argument(
+                "--scheduler",
+                metavar="ADDRESS",
+                help="a Dask scheduler (tcp://...): its workers compute by recording; with folders by rig, from the same files",
+            ),
+            EFFECTS,
+            argument(
+                "--drive",
+                action="append",
+                metavar="INPUT",
+                help="an input that the next experiment may drive (repeatable; default: inputs that changed in the "
+                "recordings, except the surroundings)",
+            ),
+            argument(
+                "--limit",
+                action="append",
+                metavar="NAME=LOW:HIGH",
+                help="range of an input or output in the next experiment (repeatable; default: the recorded range)",
+            ),
+            argument(
+                "--live",
+                action="store_true",
+                help="use the daemon's own recordings (--config) from the time when its model no longer fits",
+            ),
+            argument(
+                "--hours", type=float, default=4.0, metavar="H", help="with --live: how far back (default 4)"
+            ),
+            argument(
+                "--resolve",
+                action="store_true",
+                help="run the next experiment on the rig, then diagnose with its data",
+            ),
+            YES,
+            argument(
+                "--rounds",
+                type=int,
+                default=3,
+                metavar="N",
+                help="with --resolve: at most N experiments (default 3)",
+            ),
+            argument(
+                "--rig", metavar="PLANT", help="with --resolve: simulate this plant file instead of the rig"
+            ),
+            CONFIG,
+            argument("--json", action="store_true", help="print the result as JSON"),
+            argument("--quiet", action="store_true", help="print neither progress nor summary"),
+        ),
+        command(
+            "effects",
+            "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
+            "or save the law of a diagnosis as one (`effects save DIR NAME`)",
+            "thermoctl.root_commands:effects",
+            "",
+            argument("action", nargs="?", metavar="show|check|save"),
+            argument(
+                "files",
+                nargs="*",
+                metavar="NAME|FILE|DIR",
+                help="an effect's name; files or folders of effects; a diagnosis and a name",
+            ),
+            argument(
+                "--plant",
+                metavar="PLANT",
+                help="with check: a plant to put the effects into (default: the shipped ones)",
+            ),
+            EFFECTS,
+        ),
+    ),
+    HELP: (
+        command(
+            "init",
+            "copy configurations, device profiles, plants and examples into a folder, to start from",
+            "thermoctl.shipped:init",
+            "folder",
+            argument("folder", nargs="?", default=".", metavar="DIR", help="the folder (default: this one)"),
+        ),
+        command(
+            "report",
+            "write one archive for a question to others: versions, configuration, log, the end of the newest recording",
+            "thermoctl.support:report",
+            "settings out seconds",
+            CONFIG,
+            argument(
+                "--out",
+                default="thermoctl-report.zip",
+                metavar="FILE",
+                help="the archive (default thermoctl-report.zip)",
+            ),
+            argument(
+                "--seconds",
+                type=float,
+                default=60.0,
+                metavar="S",
+                help="of the newest recording (default 60)",
+            ),
+        ),
+        command(
+            "completion",
+            "print the shell's completion script; source it",
+            "thermoctl.manual:completion",
+            "parser shell",
+            argument("shell", choices=["bash", "zsh", "tcsh"]),
+        ),
+        command(
+            "manual",
+            "show the manual page, or install it with the shell completions",
+            "thermoctl.manual:command",
+            "parser action root",
+            argument("action", nargs="?", choices=["show", "install", "uninstall"], default="show"),
+            ROOT,
+        ),
+    ),
+}
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the daemon in the foreground, or its tick in simulated time."""
+    from thermoctl.configuration.settings import load_rig, load_settings
+
+    if args.hours is None:
+        from thermoctl.daemon import supervisor
+        from thermoctl.yamlfile import InputError
+
+        if args.axis:
+            raise InputError(
+                "run: --axis goes with --simulated-time and --hours; the daemon runs all axes of a rig"
+            )
+
+        return supervisor.run(load_rig(args.config))
+    from thermoctl.daemon.offline.simulate import trapezoids
+
+    return trapezoids(load_settings(args.config), args.hours, not args.no_compensation, args.out)
+
+
+def virtual_rig(settings: Any, line: str) -> int:
+    """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
+    from thermoctl.yamlfile import InputError
+    from thermoctl_hal.virtual.rig import main
+
+    if settings.hal.backend != "devices":
+        raise InputError(
+            f"{settings.path}: no devices to simulate: hal.backend is '{settings.hal.backend}'; "
+            "give --config config/wire.yaml"
+        )
+    return int(main(settings, line))
+
+
+def service(args: argparse.Namespace) -> int:
+    """Install or remove the unit. Removing the last unit removes manual page and completions, too."""
+    from thermoctl import manual
+    from thermoctl.daemon.service import install, uninstall, units
+
+    root, config = Path(args.root), Path(args.config) if args.config else None
+    if args.action == "install":
+        return install(config or Path(), root) or manual.command(args.parser, "install", args.root)
+    if (done := uninstall(config, root)) or units(root):
+        return done
+    return manual.command(args.parser, "uninstall", args.root)
+
+
+def effects(args: argparse.Namespace) -> int:
+    """List the catalogue of effects, show one, or check effect files."""
+    if args.action == "check":
+        from thermoctl.advice.commands import check_effects
+
+        return check_effects(args)
+    from thermoctl.diagnose import commands
+
+    args.name = args.files[0] if args.files else None
+    return commands.effects(args)
+
+
+def diagnose(args: argparse.Namespace) -> int:
+    """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
+    from thermoctl.diagnose import commands
+    from thermoctl.yamlfile import InputError
+
+    if args.explain:
+        return commands.diagnose(args)
+    for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
+        if not value:
+            raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")
+    if args.live:
+        from thermoctl.fleet.commands import live_recordings
+
+        args.recordings = live_recordings(args)
+        if not args.recordings:
+            return 0
+    from thermoctl.fleet.recordings import expanded
+
+    args.recordings = expanded(args.recordings, args.together)
+    if any(Path(r).is_dir() for r in args.recordings):
+        if args.time or args.columns or args.held_out:
+            raise InputError(
+                "diagnose: --time, --columns and --held-out go with recordings, not with folders; make the folder's files with "
+                "`thermoctl recordings import`"
+            )
+        from thermoctl.fleet.commands import diagnose_folders
+
+        return diagnose_folders(args)
+
+    def record(experiment: Path, recording: Path) -> None:
+        """Run an experiment file on the rig for --resolve and write its recording.
+
+        Raises HardwareError where it ends early, InputError where the user does not confirm it."""
+        from thermoctl.calibration.commands import record
+
+        record(experiment, recording, args.config, args.rig, args.yes)
+
+    args.record = record
+    return commands.diagnose(args)
