@@ -94,3 +94,15 @@ def test_check_compares_the_drives_unit_with_the_mode(config, capsys):
     assert main(["check", str(config)]) == 2
     error = capsys.readouterr().err
     assert "takes its command in A, and control.mode is position" in error and error.count("\n") == 1
+
+
+def test_check_warns_of_a_loop_without_real_time_priority(config, capsys):
+    change(config, ("priority: 80", "priority: 0"))
+    assert main(["check", str(config)]) == 0
+    said = capsys.readouterr().out
+    assert "warning: " in said and "loop.priority is 0" in said and "set loop.priority: 80" in said
+
+
+def test_every_shipped_configuration_asks_for_a_real_time_priority():
+    for path in (*CONFIG.glob("*.yaml"), *(CONFIG / "examples").glob("*.yaml")):
+        assert not re.search(r"^\s*priority: *0\b", path.read_text(), re.MULTILINE), path

@@ -81,6 +81,11 @@ def test_the_base_install_knows_the_simulated_rig():
     assert without(EXTRAS, "check", "config/simulated.yaml").returncode == 0
 
 
+def test_the_base_install_tunes():
+    done = without(EXTRAS, "tune", "--config", "config/simulated.yaml")
+    assert done.returncode == 0 and "kp" in done.stdout, done.stderr
+
+
 def test_the_name_hal_is_left_to_linuxcnc():
     done = without([], "check", "config/wire.yaml", names=["hal"])
     assert done.returncode == 0, done.stderr

@@ -17,7 +17,14 @@ from pathlib import Path
 from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.tick.arrival import expected_hz, slow
-from thermoctl.daemon.tick.assemble import check_mode, compensator, lacks, law_parameters, power_warning
+from thermoctl.daemon.tick.assemble import (
+    check_mode,
+    compensator,
+    lacks,
+    law_parameters,
+    power_warning,
+    priority_warning,
+)
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
@@ -35,7 +42,7 @@ def check(settings: Settings) -> int:
     make_backend(settings)
     check_mode(settings)
     without = lacks(settings)
-    if warning := power_warning(settings):
+    for warning in filter(None, (power_warning(settings), priority_warning(settings))):
         print(f"warning: {warning}")
     print(
         f"{settings.path}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "

@@ -30,8 +30,8 @@ class Simulation:
 
     `row` is the newest record row (`settings.row` has its signals), `law` the control law,
     `backend` the open back end.
-    The setting hal.backend must be simulated or replay. `model` and `parameters`: those of the settings if
-    None.
+    The setting hal.backend must be simulated or replay. `model`, `parameters` and
+    `backend`: those of the settings if None.
     """
 
     def __init__(
@@ -40,10 +40,11 @@ class Simulation:
         model: CompensatorModel | None = None,
         parameters: Parameters | None = None,
         publish: Any = None,
+        backend: Any = None,
     ):
         self.period_s = settings.loop.period_s
         self.ticks, self.now_s = 0, 0.0
-        self.backend = make_backend(settings)
+        self.backend = backend or make_backend(settings)
         self.backend.open()
         self.mailbox, self.box = (
             Mailbox(np.zeros(2, np.uint64), np.zeros((64, 2))),

@@ -44,6 +44,16 @@ def _by_channel(channels: Channels, given: Any, default: float, where: str) -> n
     return array
 
 
+def priority_warning(settings: Settings) -> str:
+    """Return a warning when the loop of a real rig asks for no real-time priority, else ''."""
+    if settings.hal.backend != "devices" or settings.loop.priority > 0:
+        return ""
+    return (
+        f"{settings.path}: loop.priority is 0: any other program may delay or skip ticks of the loop, which acts on the rig "
+        "as more dead time; set loop.priority: 80 (docs/how-to/real-time.md)"
+    )
+
+
 def power_warning(settings: Settings) -> str:
     """Return a warning with file:line when the coil's power cannot be computed, else ''."""
     protection = settings.protection
