@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.channels import AT
-from thermoctl.daemon.simulate import Simulation
-from thermoctl.settings import load_settings
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon.offline.simulate import Simulation
+from thermoctl.rig.channels import AT
 from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
 
 CONFIG = """\
