@@ -14,6 +14,7 @@ from thermoctl.calibration import chain, drive, experiment, iso230, recorded, sc
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.wizard import Wizard
 from thermoctl.configuration.settings import Settings, load_settings
+from thermoctl.extras import load
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import AT
@@ -199,6 +200,7 @@ def calibrate(
     Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
     calibrated, HardwareError for one that refuses.
     """
+    load("matplotlib", "calibrate")  # for its report: lacking, it ends before any test
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from thermoctl.calibration.steps import Model, Pid, Proof, Response, Series
 from thermoctl.report.page import figure, page, table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BLACK, ORANGE, BLUE = "#1b1f24", "#c7621b", "#0b6bcb"
 
@@ -91,6 +94,8 @@ def _response(response: Response, pid: Pid) -> str:
 
 
 def _axes(n: int = 1) -> tuple[Figure, list[Axes]]:
+    from matplotlib.figure import Figure
+
     fig = Figure(figsize=(9, 2.6 * n), layout="constrained")
     return fig, list(fig.subplots(n, 1, sharex=True, squeeze=False)[:, 0])
 

@@ -31,6 +31,7 @@ from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.drive import DrivenRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
+from thermoctl.calibration.report import report
 from thermoctl.calibration.schedules import of_config, span
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.configuration.settings import Settings, effective
@@ -128,8 +129,6 @@ class Wizard:
         """Do every step that is not done; False when it was ended early.
 
         Raises InputError where a step refuses."""
-        from thermoctl.calibration.report import report  # without matplotlib it ends here, before any test
-
         self.say(
             f"calibration of rig '{self.settings.rig.name}' on {self.rig.where}; results in {self.folder}/"
         )
@@ -148,7 +147,7 @@ class Wizard:
                 self.done[step] = self._step(step)
                 self.say(f"{number:2d}/{len(STEPS)} {step}: {self.done[step].summary}")
             self._save()
-        self._report(report)
+        self._report()
         return True
 
     def _step(self, step: str) -> steps.Result:
@@ -228,7 +227,7 @@ class Wizard:
     def _model_path(self) -> Path:
         return self.folder / "model.yaml"
 
-    def _report(self, report: Callable[..., str]) -> None:
+    def _report(self) -> None:
         path = self.folder / "report.html"
         path.write_text(
             report(
