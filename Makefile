@@ -43,14 +43,14 @@ SEED ?= 7
 NUMBER ?= 600
 prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED)
-	$(BIN)/thermoctl prove $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
+	$(BIN)/python -m tests.proof $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
 CALIBRATION ?= build/calibration
 calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 32 --seed 11102 --out $(CALIBRATION)/open_11102
 	$(BIN)/python -m tests.concealed.generate --world closed --answers inside --number 32 --seed 11101 --out $(CALIBRATION)/closed_11101
-	for world in open_11102 closed_11101; do $(BIN)/thermoctl prove $(CALIBRATION)/$$world --out $(CALIBRATION)/results/$$world || exit 1; done
-	test -z "$$THERMOCTL_RECORDINGS" || $(BIN)/thermoctl prove --real --out $(CALIBRATION)/real
+	for world in open_11102 closed_11101; do $(BIN)/python -m tests.proof $(CALIBRATION)/$$world --out $(CALIBRATION)/results/$$world || exit 1; done
+	test -z "$$THERMOCTL_RECORDINGS" || $(BIN)/python -m tests.proof --real --out $(CALIBRATION)/real
 	$(BIN)/python -m tests.diagnose.calibrate $(foreach w,open_11102 closed_11101,$(CALIBRATION)/$(w) $(CALIBRATION)/results/$(w)/cases) \
 		$${THERMOCTL_RECORDINGS:+--real "$$THERMOCTL_RECORDINGS" $(CALIBRATION)/real} --write
 
@@ -82,7 +82,7 @@ $(VENV)/.developed: $(VENV)/.installed pyproject.toml
 	@touch $@
 
 reproduce: install                 # the paper's tests by its method and by the better one
-	$(BIN)/thermoctl reproduce
+	$(BIN)/python -m tests.reproduction
 
 bench-identification: develop      # identification beside other methods; 18 million samples take 4 GB for the peer and some minutes
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
@@ -241,7 +241,7 @@ test-qemu: develop                 # SocketCAN in a qemu guest (root; Debian: qe
 
 .PHONY: diagnose-recordings
 diagnose-recordings: develop       # real recordings with naive plants: effects found, strays and gain on held-out data
-	$(BIN)/thermoctl prove --real --out build/recordings
+	$(BIN)/python -m tests.proof --real --out build/recordings
 
 .PHONY: fuzz
 FUZZ_S ?= 20

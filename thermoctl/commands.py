@@ -17,9 +17,7 @@ from thermoctl.export import command_table as export
 from thermoctl.fleet import command_table as fleet
 from thermoctl.identify import command_table as identify
 from thermoctl.plant import command_table as plant
-from thermoctl.proof import command_table as proof
 from thermoctl.recording import command_table as recording
-from thermoctl.reproduction import command_table as reproduction
 
 _TABLES = (
     daemon,
@@ -27,13 +25,11 @@ _TABLES = (
     devices,
     recording,
     calibration,
-    reproduction,
     plant,
     advice,
     export,
     identify,
     diagnose,
-    proof,
     fleet,
 )
 BY_PURPOSE: dict[str, tuple[Command, ...]] = {

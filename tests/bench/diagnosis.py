@@ -30,6 +30,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.proof import cases as proof_cases
+from tests.proof import score as scoring
 from thermoctl.diagnose.candidates import Candidate, candidates
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import catalogue
@@ -43,13 +45,12 @@ from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.run import diagnose_files
 from thermoctl.diagnose.screen import groups_of, sharpened
 from thermoctl.diagnose.screening import screened
+from thermoctl.fleet.jobs import Job
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.estimate import report
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import Excitation, SimulationError
-from thermoctl.proof import jobs as proof_jobs
-from thermoctl.proof import score as scoring
 from thermoctl.yamlfile import InputError
 
 SHORT, MOST = 8, 3
@@ -58,7 +59,7 @@ SHORT, MOST = 8, 3
 # ------------------------------------------------------------------------------------------------------- common parts
 
 
-def prepared(job: proof_jobs.Job) -> tuple[Case, Fitted]:
+def prepared(job: Job) -> tuple[Case, Fitted]:
     """The case, and its plant refitted in white noise."""
     plant = load(job.plant)
     known = case(plant, read_recordings(plant, job.recordings), catalogue(), Budget(10**6))
@@ -121,13 +122,13 @@ def extended(
 # ----------------------------------------------------------------------------------------------------------- the methods
 
 
-def thermoctl(job: proof_jobs.Job) -> dict[str, Any]:
+def thermoctl(job: Job) -> dict[str, Any]:
     """The product."""
     with tempfile.TemporaryDirectory() as out:
         return diagnose_files(job.plant, job.recordings, Path(out) / "result")
 
 
-def bic(job: proof_jobs.Job) -> dict[str, Any]:
+def bic(job: Job) -> dict[str, Any]:
     """Greedy BIC on the free run, white noise: the candidate that gains most beyond its price, until none does."""
     known, base = prepared(job)
     current = base
@@ -152,7 +153,7 @@ def bic(job: proof_jobs.Job) -> dict[str, Any]:
     return told(known, base, current)
 
 
-def sindy(job: proof_jobs.Job) -> dict[str, Any]:
+def sindy(job: Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
     known_case, base = prepared(job)
     looked = screened(known_case, base, limits())
@@ -283,11 +284,7 @@ def _sparse(
     ]
 
 
-METHODS: dict[str, Callable[[proof_jobs.Job], dict[str, Any]]] = {
-    "thermoctl": thermoctl,
-    "sindy": sindy,
-    "bic": bic,
-}
+METHODS: dict[str, Callable[[Job], dict[str, Any]]] = {"thermoctl": thermoctl, "sindy": sindy, "bic": bic}
 
 
 # ---------------------------------------------------------------------------------------------------------- the bench
@@ -299,7 +296,7 @@ def placed(answer: Mapping[str, Any], row: scoring.Row) -> bool:
     return any(scoring.same_place(e, w, p) for e, w in row.findings for p in places)
 
 
-def noise_of(job: proof_jobs.Job) -> dict[str, float]:
+def noise_of(job: Job) -> dict[str, float]:
     """What the truth would leave, for answers that do not tell: the sensors' noise as the plant file has it."""
     return {
         o.name: float(np.hypot(o.noise_sd, (o.resolution or 0.0) / np.sqrt(12)))
@@ -308,7 +305,7 @@ def noise_of(job: proof_jobs.Job) -> dict[str, float]:
     }
 
 
-def one(method: str, job: proof_jobs.Job, out: Path) -> dict[str, Any]:
+def one(method: str, job: Job, out: Path) -> dict[str, Any]:
     """Run a method on a case, or take what it gave before; keeps it in OUT/METHOD/CASE.json."""
     kept = out / method / f"{job.name}.json"
     if kept.exists() and (old := json.loads(kept.read_text()))["fingerprint"] == job.fingerprint():
@@ -331,9 +328,7 @@ def one(method: str, job: proof_jobs.Job, out: Path) -> dict[str, Any]:
 
 
 def figures(
-    jobs: Sequence[proof_jobs.Job],
-    answers: Mapping[str, Mapping[str, Any]],
-    results: Mapping[str, Mapping[str, Any]],
+    jobs: Sequence[Job], answers: Mapping[str, Mapping[str, Any]], results: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """One method's figures over all cases; each share as [k, n]."""
     rows, spots = [], []
@@ -453,8 +448,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         folders = [made]
     jobs, answers = [], {}
     for folder in folders:
-        some = proof_jobs.find_jobs(folder, a.number)
-        for job, answer in zip(some, proof_jobs.read_answers(some, a.answers).values(), strict=True):
+        some = proof_cases.find_jobs(folder, a.number)
+        for job, answer in zip(some, proof_cases.read_answers(some, a.answers).values(), strict=True):
             answers[f"{folder.name}-{job.name}"] = {"oracle_rms": noise_of(job), **answer}
         jobs += [dataclasses.replace(j, name=f"{folder.name}-{j.name}") for j in some]
     found = {}

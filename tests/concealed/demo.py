@@ -32,12 +32,12 @@ from tests.concealed.judge import snr
 from tests.concealed.rig import Scene
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.diagnose import run as diagnosis
+from thermoctl.fleet.jobs import program
 from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save
 from thermoctl.plant.estimate import updated
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.proof.jobs import program
 from thermoctl.recording.files import read_table
 from thermoctl.report import page
 from thermoctl.yamlfile import InputError

@@ -1,6 +1,6 @@
 """How much of each single effect is really left after the product's own refit, beside what the generator says.
 
-    python -m tests.concealed.left CASES ANSWERS RESULT       # RESULT: what `thermoctl prove --out` wrote
+    python -m tests.concealed.left CASES ANSWERS RESULT       # RESULT: what `python -m tests.proof --out` wrote
 
 In white noise  sigmas^2 = sum over outputs of n (rms^2 after the refit / rms^2 of the true noise - 1) + free parameters.
 Below it: how many of the small effects an ideal test finds at 4.15 sigmas (a chance of 0.5 % over 150 looks), if it knows

@@ -4,7 +4,7 @@
 
 CASES as of `python -m tests.concealed.generate --answers inside`; RESULTS: the folders that `thermoctl diagnose` wrote
 for them, by the same names. A diagnosis.json holds every hypothesis that was fitted, so it is decided again with
-other numbers, without a refit. OUT is the folder of `thermoctl prove --real RECORDINGS --out OUT`.
+other numbers, without a refit. OUT is the folder of `python -m tests.proof --real RECORDINGS --out OUT`.
 
 Of all combinations of values the best has the most right names less false ones, as a share of the effects that are
 there: in the cases, and as much again on the real rigs. Of equal ones it has the least loss. The loss of a case is the
@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from tests.proof.rigs import RIGS, Rig
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue, contained
 from thermoctl.diagnose.decide import Key, Posterior, weigh
 from thermoctl.diagnose.limits import Limits, limits
@@ -35,7 +36,6 @@ from thermoctl.diagnose.misfit import Energy, standing
 from thermoctl.diagnose.mistakes import MISTAKES
 from thermoctl.diagnose.odds import rare
 from thermoctl.plant import load
-from thermoctl.proof.rigs import RIGS, Rig
 
 NUMBERS = {
     "missing": (0.02, 0.05, 0.1, 0.2, 0.35, 0.5),

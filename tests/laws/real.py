@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.proof.rigs import RIGS, Rig
 from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.fit import fitted
 from thermoctl.diagnose.law.find import Law, find_law
@@ -17,7 +18,6 @@ from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.report.words import law_sentence
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.proof.rigs import RIGS, Rig
 
 PUBLISHED = {
     "battery": "reversible heat, I T dU/dT, that changes with the charge drawn; a resistance that rises when nearly empty",

@@ -14,6 +14,7 @@ from tests.laws.prove import EQUAL, difference
 from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
 from tests.plants import TWO_BLOCKS
+from tests.proof.rigs import RIGS
 from thermoctl.cli import main
 from thermoctl.diagnose.candidates import candidates
 from thermoctl.diagnose.case import Budget, case
@@ -36,7 +37,6 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.proof.rigs import RIGS
 from thermoctl.recording.table import Table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))

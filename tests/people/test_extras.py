@@ -57,7 +57,6 @@ def test_every_import_is_of_the_base_or_of_an_extra():
         ("rig", "doctor config/wire.yaml"),
         ("rig", "devices probe /dev/null"),
         ("report", "calibrate --config config/simulated.yaml"),
-        ("report", "reproduce"),
         ("fmu", "plant check FMU"),
         ("fleet", "fleet s3://none/none"),
     ],

@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoctl.proof import score, statistics, summary, tables
-from thermoctl.proof.jobs import find_jobs, program_files, read_answers
-from thermoctl.proof.page import page as page_of
-from thermoctl.proof.prove import prove
-from thermoctl.proof.run import run_all, run_one
+from tests.proof import score, statistics, summary, tables
+from tests.proof.cases import find_jobs, read_answers
+from tests.proof.page import page as page_of
+from tests.proof.prove import prove
+from thermoctl.fleet.batch import run_all, run_one
+from thermoctl.fleet.jobs import program_files
 from thermoctl.yamlfile import InputError
 
 
@@ -317,7 +318,7 @@ def a_dask_by_hand(folder: Path):
     quiet = {
         "stdout": subprocess.DEVNULL,
         "stderr": subprocess.DEVNULL,
-        "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        "env": {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
     }  # the task of this file must be found there
     file = folder / "scheduler.json"
     command = f"{sys.executable} -m dask scheduler --host 127.0.0.1 --port 0 --no-dashboard --scheduler-file {file}".split()

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.reproduction import closed_loop, rigs
 from thermoctl import plant
 from thermoctl.calibration import chain, iso230
 from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import experiments
 from thermoctl.report.page import page, table
-from thermoctl.reproduction import closed_loop, rigs
 from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).parents[2]

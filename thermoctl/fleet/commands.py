@@ -17,13 +17,13 @@ from rich.table import Table
 
 from thermoctl.configuration.settings import load_settings
 from thermoctl.fleet import live
+from thermoctl.fleet.batch import Reporter, cluster, run_all
 from thermoctl.fleet.health import Summary, summarise
+from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.fleet.laws import comparisons, side_by_side
 from thermoctl.fleet.recordings import find_recordings, rig_of
 from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
-from thermoctl.proof.jobs import Job, outcome
-from thermoctl.proof.run import Reporter, cluster, run_all
 from thermoctl.yamlfile import InputError, suggest
 
 

@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.reproduction import closed_loop
+from tests.reproduction.goals import Goal, Limit, goals, limits
+from tests.reproduction.report import report
+from tests.reproduction.rigs import CHAMBER, DISTURBANCES
+from tests.reproduction.seeds import Kept, SeedResult, one_seed
 from thermoctl.calibration.schedules import of_config
-from thermoctl.reproduction import closed_loop
-from thermoctl.reproduction.goals import Goal, Limit, goals, limits
-from thermoctl.reproduction.report import report
-from thermoctl.reproduction.rigs import CHAMBER, DISTURBANCES
-from thermoctl.reproduction.seeds import Kept, SeedResult, one_seed
 
 SEEN, FRESH = (*range(12), *range(1000, 1012)), tuple(range(2000, 2012))
 """Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, chain.PAPER_CHOICES,

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from tests.reproduction import rigs, tables
+from tests.reproduction.figures import figures
+from tests.reproduction.goals import Goal, Limit
+from tests.reproduction.seeds import Kept, MeanTwoS, SeedResult
 from thermoctl.calibration import chain
 from thermoctl.identify import filter
 from thermoctl.report.page import page, table
-from thermoctl.reproduction import rigs, tables
-from thermoctl.reproduction.figures import figures
-from thermoctl.reproduction.goals import Goal, Limit
-from thermoctl.reproduction.seeds import Kept, MeanTwoS, SeedResult
 from thermoctl.rig.signals import POINTS
 
 Section = tuple[str, str]

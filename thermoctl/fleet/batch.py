@@ -17,7 +17,7 @@ from typing import Any, TextIO
 from thermoctl import __version__
 from thermoctl.diagnose.run import diagnose_files
 from thermoctl.extras import load
-from thermoctl.proof.jobs import Job, Run, done
+from thermoctl.fleet.jobs import Job, Run, done
 from thermoctl.yamlfile import InputError
 
 RETRIES = 3  # number of workers that may die on one case before it counts as failed
@@ -33,7 +33,7 @@ def run_one(job: Job, out: str) -> Run:
         diagnose_files(job.plant, job.recordings, out, [Path(e) for e in job.effects], job.held_out)
     except InputError as e:
         error = str(e)
-    except Exception as e:  # a crash is a result of the proof
+    except Exception as e:  # a crash of one does not end the others
         error = f"{type(e).__name__}: {e}"
     run = _run(job, error, round(time.monotonic() - started, 2))
     run["cpu_s"] = round(time.process_time() - cpu, 2)

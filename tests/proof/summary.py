@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from thermoctl.proof.score import NAMING, Row
-from thermoctl.proof.statistics import Share, by_chance, found_by_size, quantile, reliability, share
+from tests.proof.score import NAMING, Row
+from tests.proof.statistics import Share, by_chance, found_by_size, quantile, reliability, share
 
 BANDS = ("large", "middle", "small")  # of an effect's size: above 15, 6 to 15, 3 to 6 sigmas
 ONSET_SHARE = 0.02  # share of the recording's length: an onset with a smaller error counts as right

@@ -15,12 +15,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tests.proof.cases import find_jobs, read_answers
+from tests.proof.page import page
+from tests.proof.score import Row, plain, score
+from tests.proof.summary import summary
 from thermoctl import __version__
-from thermoctl.proof.jobs import Job, find_jobs, outcome, read_answers
-from thermoctl.proof.page import page
-from thermoctl.proof.run import OnCase, run_all
-from thermoctl.proof.score import Row, plain, score
-from thermoctl.proof.summary import summary
+from thermoctl.fleet.batch import OnCase, run_all
+from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.recording.files import read_table
 from thermoctl.yamlfile import InputError
 

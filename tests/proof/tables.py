@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from thermoctl.proof.recordings import Entry
+from tests.proof.recordings import Entry
 
 Line = tuple[
     str, str, str, str, str, bool | None

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tests.reproduction.seeds import Kept
 from thermoctl.calibration import chain
 from thermoctl.calibration.recorded import Recorded, filled
 from thermoctl.calibration.schedules import CUTOFF_HZ
 from thermoctl.identify import experiments
 from thermoctl.report.page import figure
-from thermoctl.reproduction.seeds import Kept
 from thermoctl.rig.signals import POINTS
 
 SHOWN = (0, 2, 5, 8, 10)  # points whose rises are drawn

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tests.reproduction.rigs import CALIBRATED_S, CHAMBER, PAPER_SCALE, PROOF_DAY, ProvingRig, joined
 from thermoctl import plant
 from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import experiments
-from thermoctl.reproduction.rigs import CALIBRATED_S, CHAMBER, PAPER_SCALE, PROOF_DAY, ProvingRig, joined
 
 CALIBRATION = int(CALIBRATED_S)  # samples of test 4A at 1 s
 MeanTwoS = tuple[float, float]  # um

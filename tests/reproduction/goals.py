@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermoctl.reproduction import tables
-from thermoctl.reproduction.rigs import DISTURBANCES
-from thermoctl.reproduction.seeds import SeedResult
+from tests.reproduction import tables
+from tests.reproduction.rigs import DISTURBANCES
+from tests.reproduction.seeds import SeedResult
 
 THREEFOLD = 0.4  # of SISO's repeatability: a ratio of 2.5 or more rounds to the paper's threefold
 

@@ -10,10 +10,10 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thermoctl.proof.score import Row
-from thermoctl.proof.statistics import Share
-from thermoctl.proof.summary import BANDS
-from thermoctl.proof.tables import lines
+from tests.proof.score import Row
+from tests.proof.statistics import Share
+from tests.proof.summary import BANDS
+from tests.proof.tables import lines
 from thermoctl.report import page as sheet
 
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.reproduction.plants import HEATED, quasi_static
+from tests.reproduction.rigs import PAPER_SCALE
 from thermoctl import plant
 from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
@@ -27,8 +29,6 @@ from thermoctl.identify import experiments
 from thermoctl.plant import extended
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.reproduction.plants import HEATED, quasi_static
-from thermoctl.reproduction.rigs import PAPER_SCALE
 from thermoctl.rig.signals import INDEX, NAMES, POINTS
 
 

@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoctl.proof.jobs import Job, Run, outcome
-from thermoctl.proof.rigs import RIGS, Rig
-from thermoctl.proof.run import OnCase, run_all
-from thermoctl.proof.score import CONFIDENT
+from tests.proof.rigs import RIGS, Rig
+from tests.proof.score import CONFIDENT
+from thermoctl.fleet.batch import OnCase, run_all
+from thermoctl.fleet.jobs import Job, Run, outcome
 from thermoctl.yamlfile import InputError
 
 VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
@@ -42,7 +42,7 @@ def recordings_folder(given: str | None) -> Path:
     """Return the given folder, else that of the environment. Raises InputError."""
     name = given or os.environ.get(VARIABLE)
     if not name:
-        raise InputError(f"prove --real: a folder of recordings was expected, as argument or in {VARIABLE}")
+        raise InputError(f"--real: a folder of recordings was expected, as argument or in {VARIABLE}")
     if not Path(name).is_dir():
         raise InputError(f"{name}: no such folder; the folder of real recordings was expected")
     return Path(name)

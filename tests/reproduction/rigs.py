@@ -18,6 +18,7 @@ import numpy as np
 from scipy import linalg
 from scipy.signal import lfilter
 
+from tests.reproduction.plants import HEATED, hidden_masses, quasi_static
 from thermoctl.calibration.chain import NOISE_K, STEP_K
 from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import filter, kernels
@@ -25,7 +26,6 @@ from thermoctl.identify.experiments import Schedule
 from thermoctl.plant import Plant
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.reproduction.plants import HEATED, hidden_masses, quasi_static
 from thermoctl.rig.signals import POINTS
 
 PAPER_SCALE = {
