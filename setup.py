@@ -7,10 +7,18 @@ import numpy
 from Cython.Build import cythonize
 from setuptools import Extension, setup
 
-typed = [p for root in ("thermoctl", "thermoctl_hal") for p in Path(root).rglob("*.p[xy][xd]")]
+HAL = Path("hal")  # `import hal` is LinuxCNC's: the folder holds the package thermoctl_hal
+typed = [p for root in ("thermoctl", "hal") for p in Path(root).rglob("*.p[xy][xd]")]
 sources = sorted(
     {p.with_suffix(".pyx") if p.with_suffix(".pyx").exists() else p.with_suffix(".py") for p in typed}
 )
+
+
+def module(source: Path) -> str:
+    """Return the dotted name of a source file."""
+    inside = source.relative_to(HAL) if HAL in source.parents else source
+    return ".".join(inside.with_suffix("").parts)
+
 
 # Beside the package, under share/thermoctl: thermoctl/shipped.py finds them.
 files = sorted(
@@ -27,7 +35,7 @@ setup(
     ext_modules=cythonize(
         [
             Extension(
-                ".".join(p.with_suffix("").parts),
+                module(p),
                 [str(p)],
                 include_dirs=[numpy.get_include()],
                 extra_compile_args=["-O2", "-g0", "-ffp-contract=off"],
@@ -36,5 +44,6 @@ setup(
             for p in sources
         ],
         compiler_directives={"language_level": "3"},
+        include_path=[".", str(HAL)],
     ),
 )

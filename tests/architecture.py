@@ -23,10 +23,10 @@ Graph = dict[str, set[str]]
 def modules() -> dict[str, Path]:
     """Every module of the product by its dotted name; a package is its `__init__`."""
     found = {}
-    for top in ("thermoctl", "thermoctl_hal"):
-        for path in sorted((ROOT / top).rglob("*.py*")):
+    for folder, top in ((ROOT, "thermoctl"), (ROOT / "hal", "thermoctl_hal")):
+        for path in sorted((folder / top).rglob("*.py*")):
             if path.suffix in (".py", ".pyx", ".pxd"):
-                parts = path.relative_to(ROOT).with_suffix("").parts
+                parts = path.relative_to(folder).with_suffix("").parts
                 found.setdefault(".".join(parts[:-1] if parts[-1] == "__init__" else parts), path)
     return found
 
@@ -63,10 +63,10 @@ def module_graph() -> Graph:
 
 
 def package(module: str) -> str:
-    """The package or loose module of the product that a module belongs to: `plant`, `yamlfile`, `hal`, `hal.virtual`."""
+    """The package or loose module of the product that a module belongs to: `plant`, `yamlfile`, `hal.can`."""
     parts = module.split(".")
     if parts[0] == "thermoctl_hal":
-        return "hal.virtual" if parts[1:2] == ["virtual"] else "hal"
+        return ".".join(["hal", *parts[1:2]])
     return parts[1] if len(parts) > 1 else "thermoctl"
 
 

@@ -61,7 +61,13 @@ class Text:
     @property
     def package(self) -> str:
         parts = self.path.relative_to(ROOT).with_suffix("").parts
-        return parts[0] if parts[0] == "hal" or len(parts) == 2 else ".".join(parts[:2])
+        return (
+            ".".join(parts[1:-1])
+            if parts[0] == "hal"
+            else ".".join(parts[:2])
+            if len(parts) > 2
+            else parts[0]
+        )
 
     def sentences(self) -> list[str]:
         """Return the sentences of its prose, without equations, which stand indented."""

@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"thermoctl: {args.row.name}: {line}", file=sys.stderr)
         return 2
     except Exception as e:
-        from thermoctl_hal.backend import HardwareError
+        from thermoctl_hal.base.backend import HardwareError
 
         if not isinstance(e, HardwareError):
             raise

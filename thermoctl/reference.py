@@ -29,8 +29,8 @@ from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.signals import FAULT_WORD_BITS, SIGNALS
-from thermoctl_hal.key import REQUIRED, Key
-from thermoctl_hal.keys import TABLES
+from thermoctl_hal.base.key import REQUIRED, Key
+from thermoctl_hal.profiles.keys import TABLES
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 _HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"

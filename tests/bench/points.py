@@ -27,7 +27,7 @@ from thermoctl.daemon.tick.loop import Rig
 from thermoctl.daemon.tick.ring import Ring
 from thermoctl.rig.channels import AT, COIL, DEFAULT, Channels, Point, of_points
 from thermoctl.rig.signals import OUTPUTS, of_channels
-from thermoctl_hal.backend import ABSENT, OK, Sample
+from thermoctl_hal.base.backend import ABSENT, OK, Sample
 
 TICKS, REPEATS = 5000, 15
 HERE = Path(__file__).parent

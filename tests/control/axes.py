@@ -1,6 +1,6 @@
 """What axes of a rig have in common, as scenarios: a fault of one disarms another or not, a sensor of all reaches all.
 
-Each takes the code: `Rig` of loop.py, `guard` of processes.py, `AxisBackend` of hal/axes.py, and channels.py. The tests run them on
+Each takes the code: `Rig` of loop.py, `guard` of processes.py, `AxisBackend` of hal/thermoctl_hal/rig/axes.py, and channels.py. The tests run them on
 the product, mutants.py on every small change of MUTATED.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-import thermoctl_hal.axes
+import thermoctl_hal.rig.axes
 from thermoctl.control import arming, faults
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon import processes
@@ -25,12 +25,12 @@ from thermoctl.rig import channels
 from thermoctl.rig.channels import AT, COIL
 from thermoctl.rig.signals import AT as SIGNAL_AT
 from thermoctl.rig.signals import fault_word
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
+from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
 
 MUTATED = (
     (Path(loop.__file__).with_name("loop.py"), ("for other in self.guards:", "trips_others")),
     (Path(processes.__file__), ("guard",)),
-    (Path(thermoctl_hal.axes.__file__), ("__init__", "read", "write", "problem")),
+    (Path(thermoctl_hal.rig.axes.__file__), ("__init__", "read", "write", "problem")),
     (Path(channels.__file__), ("names", "index", "parts", "copies")),
 )
 """Files and their functions: of channels.py those of AxesChannels."""
@@ -58,7 +58,7 @@ def build(trees: dict[str, ast.Module]) -> SimpleNamespace:
 
 
 PRODUCT = SimpleNamespace(
-    Rig=loop.Rig, guard=processes.guard, AxisBackend=thermoctl_hal.axes.AxisBackend, channels=channels
+    Rig=loop.Rig, guard=processes.guard, AxisBackend=thermoctl_hal.rig.axes.AxisBackend, channels=channels
 )
 
 

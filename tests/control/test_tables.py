@@ -87,7 +87,7 @@ def test_a_channel_is_added_in_one_row():
         {"thermoctl.rig.channels": (end, end + row)},
         """
 import numpy as np
-from thermoctl_hal.backend import ROLES, Sample
+from thermoctl_hal.base.backend import ROLES, Sample
 from thermoctl import reference
 from thermoctl.rig import channels, signals
 from thermoctl.control import causes, faults, law, model

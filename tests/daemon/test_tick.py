@@ -17,7 +17,7 @@ from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.rig.channels import CHANNELS, DEFAULT
 from thermoctl.rig.signals import INDEX, NAMES, SIGNALS
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ERROR, OK, ROLE, ROLES, STALE
+from thermoctl_hal.base.backend import ERROR, OK, ROLE, ROLES, STALE
 
 
 def column(rows, name):

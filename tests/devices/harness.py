@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from thermoctl import yamlfile
-from thermoctl_hal.backend import ROLE, STATUS_NAMES, Sample
-from thermoctl_hal.binding import bind, check_rig
-from thermoctl_hal.device import Device
-from thermoctl_hal.devices import DevicesBackend
-from thermoctl_hal.make import driver
+from thermoctl_hal.base.backend import ROLE, STATUS_NAMES, Sample
+from thermoctl_hal.base.device import Device
+from thermoctl_hal.profiles.bind import bind, check_rig
+from thermoctl_hal.rig.devices import DevicesBackend
+from thermoctl_hal.rig.make import driver
 
 HEAD = "format: thermoctl-device/1\nvendor: test\nmodel: test\n"
 POSITION = "unit: um, range: [-1e9, 1e9], rate_hz: 10, stale_after_s: 5"

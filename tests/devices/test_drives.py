@@ -16,10 +16,10 @@ from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode
 from tests.devices.harness import HEAD, Rig, wait
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
-from thermoctl_hal.binding import bind, check_rig, rig_notes
-from thermoctl_hal.make import driver
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
+from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.make import driver
 
 AXIS_DBC = """VERSION ""
 NS_ :
@@ -470,7 +470,7 @@ def test_a_drive_that_takes_can_fd_frames(tmp_path):
     import can
 
     from thermoctl.devices.library import find
-    from thermoctl_hal.probe import Probe
+    from thermoctl_hal.rig.probe import Probe
 
     name = f"moteus-{tmp_path.name}"
     bus = can.Bus(name, interface="virtual", fd=True)

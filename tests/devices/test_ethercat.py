@@ -17,11 +17,11 @@ from tests.devices.harness import Rig
 from thermoctl import yamlfile
 from thermoctl.devices.library import find
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, HardwareError, Sample
-from thermoctl_hal.binding import bind, check_rig, rig_notes
-from thermoctl_hal.make import driver
-from thermoctl_hal.probe import Probe, read_for
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, HardwareError, Sample
+from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.make import driver
+from thermoctl_hal.rig.probe import Probe, read_for
 
 WHY_NOT = why_not()
 wire = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT or "-")

@@ -12,10 +12,10 @@ import pytest
 
 from tests.devices.harness import HEAD, POSITION, Line, make, wait
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ERROR, ROLE, Sample
-from thermoctl_hal.checksum import algorithm, names
-from thermoctl_hal.read_profile import load_profile
-from thermoctl_hal.wire import checksum
+from thermoctl_hal.base.backend import ERROR, ROLE, Sample
+from thermoctl_hal.base.checksum import algorithm, names
+from thermoctl_hal.base.wire import checksum
+from thermoctl_hal.profiles.read import load_profile
 
 P = ROLE["position_um"]
 

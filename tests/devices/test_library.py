@@ -16,9 +16,9 @@ from thermoctl.devices.library import cited, find
 from thermoctl.devices.new import new
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import HardwareError
-from thermoctl_hal.probe import Probe, read_for
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.probe import Probe, read_for
 
 NOT_CITED = ("; written from memory, the manual was not at hand", "; its edition is not known")
 NAMES = sorted(p.stem for p in shipped("config/devices/library").glob("*.yaml"))

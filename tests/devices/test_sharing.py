@@ -11,11 +11,11 @@ from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode
 from tests.devices.harness import HEAD, Line, Rig
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
-from thermoctl_hal import modbus_link
-from thermoctl_hal.backend import HardwareError, Sample
-from thermoctl_hal.binding import bind, check_rig
-from thermoctl_hal.can_bus import open_can
-from thermoctl_hal.profile import LineSettings
+from thermoctl_hal.base.backend import HardwareError, Sample
+from thermoctl_hal.base.profile import LineSettings
+from thermoctl_hal.can.bus import open_can
+from thermoctl_hal.modbus import link as modbus_link
+from thermoctl_hal.profiles.bind import bind, check_rig
 
 READ = "rate_hz: 50, stale_after_s: 5"
 TC = f"""{HEAD}bus: modbus

@@ -27,14 +27,14 @@ from typing import Any
 import can
 
 from thermoctl import yamlfile
-from thermoctl_hal.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
-from thermoctl_hal.binding import bind
-from thermoctl_hal.can_bus import open_can
-from thermoctl_hal.dbc import DbcDevice
-from thermoctl_hal.drive import Cia402Device
-from thermoctl_hal.modbus import ModbusDevice
-from thermoctl_hal.serial_port import SerialDevice
-from thermoctl_hal.wire import Framer
+from thermoctl_hal.base.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
+from thermoctl_hal.base.wire import Framer
+from thermoctl_hal.can.bus import open_can
+from thermoctl_hal.can.dbc import DbcDevice
+from thermoctl_hal.can.drive import Cia402Device
+from thermoctl_hal.modbus.device import ModbusDevice
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.serial.port import SerialDevice
 
 CONFIG = Path(__file__).parents[2] / "config/devices"
 FOLDER = Path(tempfile.mkdtemp(prefix="thermoctl-fuzz-"))

@@ -61,9 +61,9 @@ def config() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """A configuration, with its device profiles and faults."""
     from thermoctl.configuration.settings import effective, load_settings
     from thermoctl.daemon.tick.assemble import law_parameters
-    from thermoctl_hal.binding import bind
-    from thermoctl_hal.faulty import schedule
-    from thermoctl_hal.read_profile import load_profile
+    from thermoctl_hal.profiles.bind import bind
+    from thermoctl_hal.profiles.read import load_profile
+    from thermoctl_hal.simulated.faulty import schedule
 
     def one(data: bytes) -> None:
         settings = load_settings(_file(data, ".yaml"))
@@ -115,9 +115,9 @@ def _cut(data: bytes) -> list[bytes]:
 
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
-    from thermoctl_hal.profile import BinaryFrame
-    from thermoctl_hal.serial_line import LineReader
-    from thermoctl_hal.wire import Framer
+    from thermoctl_hal.base.profile import BinaryFrame
+    from thermoctl_hal.base.wire import Framer
+    from thermoctl_hal.serial.line import LineReader
 
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
     specs = [
@@ -148,8 +148,8 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
-    from thermoctl_hal.drive import drive_state, next_control_word
-    from thermoctl_hal.wire import SlcanParser, encode_slcan
+    from thermoctl_hal.base.wire import SlcanParser, encode_slcan
+    from thermoctl_hal.can.drive import drive_state, next_control_word
 
     def one(data: bytes) -> None:
         parser = SlcanParser()
@@ -177,9 +177,9 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
     import threading
 
     from thermoctl import yamlfile
-    from thermoctl_hal.backend import HardwareError, Sample
-    from thermoctl_hal.binding import bind
-    from thermoctl_hal.modbus import ModbusDevice
+    from thermoctl_hal.base.backend import HardwareError, Sample
+    from thermoctl_hal.modbus.device import ModbusDevice
+    from thermoctl_hal.profiles.bind import bind
 
     listener = socket.create_server(("127.0.0.1", 0))
     answer = [b""]

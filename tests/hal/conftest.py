@@ -13,7 +13,7 @@ import pytest
 
 from thermoctl import yamlfile
 from thermoctl.rig.channels import DEFAULT
-from thermoctl_hal.backend import ROLE, STATUS_NAMES, Sample
+from thermoctl_hal.base.backend import ROLE, STATUS_NAMES, Sample
 from thermoctl_hal.virtual.rig import VirtualRig
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -13,10 +13,20 @@ from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ABSENT, AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, ROLES, STALE, Sample
-from thermoctl_hal.faulty import FaultInjector, schedule
-from thermoctl_hal.make import make_backend
-from thermoctl_hal.replay import ReplayBackend
+from thermoctl_hal.base.backend import (
+    ABSENT,
+    AMP_DISABLED,
+    AMP_ENABLED,
+    ERROR,
+    OK,
+    ROLE,
+    ROLES,
+    STALE,
+    Sample,
+)
+from thermoctl_hal.rig.make import make_backend
+from thermoctl_hal.simulated.faulty import FaultInjector, schedule
+from thermoctl_hal.simulated.replay import ReplayBackend
 
 POSITION, COIL, AIR, STATE = (ROLE[r] for r in ("position_um", "coil_c", "air_c", "amplifier_state"))
 

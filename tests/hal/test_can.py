@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoctl_hal.backend import (
+from thermoctl_hal.base.backend import (
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
@@ -15,8 +15,9 @@ from thermoctl_hal.backend import (
     HardwareError,
     Sample,
 )
-from thermoctl_hal.can_bus import open_can
-from thermoctl_hal.drive import drive_state, next_control_word
+from thermoctl_hal.base.wire import EXTENDED, SlcanParser, encode_slcan
+from thermoctl_hal.can.bus import open_can
+from thermoctl_hal.can.drive import drive_state, next_control_word
 from thermoctl_hal.virtual.drive import (
     DISABLED,
     ENABLED,
@@ -26,7 +27,6 @@ from thermoctl_hal.virtual.drive import (
     Cia402Drive,
     SlcanAdapter,
 )
-from thermoctl_hal.wire import EXTENDED, SlcanParser, encode_slcan
 
 
 def test_slcan_ascii():
@@ -222,9 +222,9 @@ def test_library_port_over_the_virtual_interface():
 def test_dbc_device_decodes_what_cantools_encodes(tmp_path):
     from tests.hal.conftest import CONFIG
     from thermoctl import yamlfile
-    from thermoctl_hal.backend import ROLE
-    from thermoctl_hal.binding import bind
-    from thermoctl_hal.dbc import DbcDevice
+    from thermoctl_hal.base.backend import ROLE
+    from thermoctl_hal.can.dbc import DbcDevice
+    from thermoctl_hal.profiles.bind import bind
 
     node = yamlfile.loads(
         "{profile: meter-can.yaml, port: 'virtual:dbc', roles: {voltage: voltage_v, current: current_a}}"

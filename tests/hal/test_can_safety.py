@@ -17,13 +17,22 @@ import pytest
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE, STALE, HardwareError, Sample
-from thermoctl_hal.binding import bind, check_rig
-from thermoctl_hal.dbc import DbcDevice
-from thermoctl_hal.devices import DevicesBackend
-from thermoctl_hal.drive import Cia402Device
-from thermoctl_hal.read_profile import load_profile
-from thermoctl_hal.wire import SlcanParser
+from thermoctl_hal.base.backend import (
+    AMP_DISABLED,
+    AMP_ENABLED,
+    ERROR,
+    OK,
+    ROLE,
+    STALE,
+    HardwareError,
+    Sample,
+)
+from thermoctl_hal.base.wire import SlcanParser
+from thermoctl_hal.can.dbc import DbcDevice
+from thermoctl_hal.can.drive import Cia402Device
+from thermoctl_hal.profiles.bind import bind, check_rig
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.devices import DevicesBackend
 
 STATE, VOLTAGE, CURRENT, SUPPLY = (ROLE[r] for r in ("amplifier_state", "voltage_v", "current_a", "supply_v"))
 EDS = (CONFIG / "devices/drive-cia402.eds").read_text()
@@ -516,7 +525,7 @@ def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path
     from types import SimpleNamespace
 
     from thermoctl.rig.channels import DEFAULT
-    from thermoctl_hal.make import disable_amplifier
+    from thermoctl_hal.rig.make import disable_amplifier
 
     drive, m = bus.drive(5), bus.master(5)
     m.backend.open()
@@ -542,7 +551,7 @@ def test_the_amplifier_is_switched_off_although_nothing_else_opens(bus, tmp_path
 
 
 def test_a_device_that_nobody_requires_may_be_absent_at_the_start(tmp_path, bus):
-    from thermoctl_hal.serial_port import SerialDevice
+    from thermoctl_hal.serial.port import SerialDevice
 
     bus.drive(5)
     m = bus.master(5)

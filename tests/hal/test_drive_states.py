@@ -10,7 +10,7 @@ import pytest
 
 from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
-from thermoctl_hal.backend import (
+from thermoctl_hal.base.backend import (
     AMP_DISABLED,
     AMP_ENABLED,
     AMP_FAULT,
@@ -19,9 +19,9 @@ from thermoctl_hal.backend import (
     ROLE,
     Sample,
 )
-from thermoctl_hal.binding import bind
-from thermoctl_hal.drive import Cia402Device
-from thermoctl_hal.wire import CanPort
+from thermoctl_hal.base.wire import CanPort
+from thermoctl_hal.can.drive import Cia402Device
+from thermoctl_hal.profiles.bind import bind
 
 STATE = ROLE["amplifier_state"]
 NOT_READY, DISABLED, READY, SWITCHED_ON = 0x0000, 0x0250, 0x0231, 0x0233

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoctl_hal.modbus import decode, plan_blocks
-from thermoctl_hal.profile import Register
+from thermoctl_hal.base.profile import Register
+from thermoctl_hal.base.wire import checksum
+from thermoctl_hal.modbus.device import decode, plan_blocks
 from thermoctl_hal.virtual.modbus import ModbusUnit, encode
-from thermoctl_hal.wire import checksum
 
 
 def register(address, type="int16", kind="input", order="big"):

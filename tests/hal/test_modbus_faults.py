@@ -15,12 +15,12 @@ import tty
 import pytest
 
 from thermoctl import yamlfile
-from thermoctl_hal.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
-from thermoctl_hal.binding import bind
-from thermoctl_hal.board import Board
-from thermoctl_hal.devices import DevicesBackend
-from thermoctl_hal.modbus import LOST_POLLS, ModbusDevice
-from thermoctl_hal.poller import poll_until
+from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
+from thermoctl_hal.modbus.device import LOST_POLLS, ModbusDevice
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.board import Board
+from thermoctl_hal.rig.devices import DevicesBackend
+from thermoctl_hal.rig.poller import poll_until
 
 COIL, AIR, SHAFT = (ROLE[r] for r in ("coil_c", "air_c", "shaft_1_c"))
 PROFILE = """

@@ -24,11 +24,11 @@ from thermoctl.daemon.tick.loop import Rig, run_loop
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.signals import AT, INDEX
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ROLE
-from thermoctl_hal.binding import bind
-from thermoctl_hal.devices import DevicesBackend
-from thermoctl_hal.make import driver
-from thermoctl_hal.wire import Framer
+from thermoctl_hal.base.backend import ROLE
+from thermoctl_hal.base.wire import Framer
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.devices import DevicesBackend
+from thermoctl_hal.rig.make import driver
 
 PERIOD_S = 0.005
 

@@ -8,9 +8,9 @@ from tests.hal.conftest import CONFIG
 from thermoctl import yamlfile
 from thermoctl.configuration.settings import load_settings
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.binding import bind, check_rig, resolve_port
-from thermoctl_hal.make import make_devices
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.profiles.bind import bind, check_rig, resolve_port
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.make import make_devices
 from thermoctl_hal.virtual.rig import virtual_device
 
 PROFILES = sorted((CONFIG / "devices").glob("*.yaml"))
@@ -94,7 +94,7 @@ def test_each_mistake_has_its_place_and_a_word(tmp_path, good, old, new, message
 
 @given(st.integers(0, len(ENCODER) - 1), st.sampled_from(["", " ", ":", "{", "[", "x", "-", "\t", "0", "'"]))
 def test_a_damaged_profile_is_read_or_refused_never_a_traceback(tmp_path_factory, at, put):
-    from thermoctl_hal.read_profile import FORMAT
+    from thermoctl_hal.profiles.read import FORMAT
 
     path = tmp_path_factory.getbasetemp() / "damaged-profile.yaml"
     path.write_text(ENCODER[:at] + put + ENCODER[at + 1 :])

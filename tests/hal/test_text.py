@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from thermoctl import yamlfile
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ROLE, Sample
-from thermoctl_hal.binding import bind
-from thermoctl_hal.read_profile import load_profile
-from thermoctl_hal.serial_port import SerialDevice
-from thermoctl_hal.text_number import number, takes_letters
+from thermoctl_hal.base.backend import ROLE, Sample
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.serial.port import SerialDevice
+from thermoctl_hal.serial.text_number import number, takes_letters
 
 POSITION = ROLE["position_um"]
 PROFILE = """

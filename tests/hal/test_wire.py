@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from thermoctl_hal.backend import (
+from thermoctl_hal.base.backend import (
     ABSENT,
     AMP_DISABLED,
     AMP_ENABLED,
@@ -22,9 +22,9 @@ from thermoctl_hal.backend import (
     HardwareError,
     Sample,
 )
-from thermoctl_hal.board import Board
-from thermoctl_hal.make import make_backend, make_devices
-from thermoctl_hal.poller import poll_until
+from thermoctl_hal.rig.board import Board
+from thermoctl_hal.rig.make import make_backend, make_devices
+from thermoctl_hal.rig.poller import poll_until
 from thermoctl_hal.virtual.drive import HEARTBEAT_LOST
 from thermoctl_hal.virtual.rig import tell
 
@@ -294,8 +294,8 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
     """termios.error is no OSError: it would end the thread that connects a device again."""
     import termios
 
-    from thermoctl_hal.profile import LineSettings
-    from thermoctl_hal.serial_line import open_port
+    from thermoctl_hal.base.profile import LineSettings
+    from thermoctl_hal.serial.line import open_port
 
     master, slave = os.openpty()
 

@@ -18,8 +18,8 @@ from thermoctl.control import arming, faults
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.plant import load
 from thermoctl.rig.signals import INDEX
-from thermoctl_hal.backend import ROLE
-from thermoctl_hal.faulty import Fault, FaultInjector
+from thermoctl_hal.base.backend import ROLE
+from thermoctl_hal.simulated.faulty import Fault, FaultInjector
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = 50.0  # the quick rig's heat capacities are so many times smaller
@@ -77,7 +77,7 @@ def quick_settings(folder: Path):
 
 
 class HazardRig(Simulation):
-    """A simulation that can be spoiled: `inject` begins a fault of thermoctl_hal.faulty in the next tick, `mend` ends all."""
+    """A simulation that can be spoiled: `inject` begins a fault of thermoctl_hal.simulated.faulty in the next tick, `mend` ends all."""
 
     def __init__(self, settings, model=None, parameters=None, publish=None):
         super().__init__(settings, model, parameters, publish)

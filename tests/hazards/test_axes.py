@@ -16,7 +16,7 @@ from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.rig.channels import AT
 from thermoctl.rig.signals import AT as SIGNAL_AT
-from thermoctl_hal.make import make_backends
+from thermoctl_hal.rig.make import make_backends
 
 GO_ON = "  on_other_axis_fault: go_on"
 

@@ -15,7 +15,7 @@ from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.tick.loop import RELOAD, Rig
 from thermoctl.daemon.tick.ring import Box, Mailbox
 from thermoctl.rig.signals import INDEX
-from thermoctl_hal.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
+from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
 
 NEEDED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c", "amplifier_state")
 LIMIT = 1.5

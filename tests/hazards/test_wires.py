@@ -17,12 +17,12 @@ import pytest
 
 from tests.hazards.harness import ROOT, HazardRig, say
 from thermoctl import yamlfile
-from thermoctl_hal.backend import ROLE, Sample
-from thermoctl_hal.devices import DevicesBackend
-from thermoctl_hal.make import make_devices
+from thermoctl_hal.base.backend import ROLE, Sample
+from thermoctl_hal.base.wire import Framer
+from thermoctl_hal.rig.devices import DevicesBackend
+from thermoctl_hal.rig.make import make_devices
 from thermoctl_hal.virtual import drive as drives
 from thermoctl_hal.virtual.device import Pty
-from thermoctl_hal.wire import Framer
 
 ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "supply_v")
 

@@ -11,8 +11,8 @@ from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_n
 from thermoctl.daemon.tick.loop import Rig
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.signals import INDEX
-from thermoctl_hal.backend import ERROR, OK, ROLE
-from thermoctl_hal.make import make_backend
+from thermoctl_hal.base.backend import ERROR, OK, ROLE
+from thermoctl_hal.rig.make import make_backend
 
 
 class Spoilt:

@@ -1,7 +1,7 @@
 """Cause -> first line -> remedy: one thing is broken on an armed rig, and the first line a person reads has to name it.
 
 `make causes` writes docs/proof/causes.md. The devices of the wires are the real drivers; their other ends are played in
-simulated time (tests/hazards), as are the spoiled readings of thermoctl_hal.faulty.
+simulated time (tests/hazards), as are the spoiled readings of thermoctl_hal.simulated.faulty.
 """
 
 import math
@@ -16,7 +16,7 @@ from tests.hazards.test_wires import ERROR_FRAME, KernelBus, WiredRig
 from thermoctl.daemon.answers.display import fault_lines, message_lines
 from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.tick.shared import Shared
-from thermoctl_hal.backend import ROLE
+from thermoctl_hal.base.backend import ROLE
 
 ROWS: list[tuple[str, str, str, str]] = []
 COUNT_UM = 0.005  # of config/devices/encoder-serial.yaml

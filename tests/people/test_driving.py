@@ -26,8 +26,8 @@ from thermoctl.daemon.control_socket import Connection, ask
 from thermoctl.identify.experiments import Schedule
 from thermoctl.rig.signals import INDEX
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import ROLE
-from thermoctl_hal.faulty import Fault, FaultInjector
+from thermoctl_hal.base.backend import ROLE
+from thermoctl_hal.simulated.faulty import Fault, FaultInjector
 
 STATE, COMMAND = INDEX["state"], INDEX["command"]
 EXPERIMENT = """\
@@ -268,7 +268,7 @@ def test_a_connection_that_ends_disarms_only_what_it_armed(folder, running):
 @pytest.mark.parametrize("kind", ["nan", "drop", "disconnect"])
 def test_the_simulated_rig_runs_the_same_law(kind, folder, capsys, monkeypatch):
     """Without a daemon, in simulated time: a hazard trips the law there, too."""
-    from thermoctl_hal.simulated import SimulatedBackend
+    from thermoctl_hal.simulated.rig import SimulatedBackend
 
     sent, write = [], SimulatedBackend.write
     monkeypatch.setattr(

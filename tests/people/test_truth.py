@@ -28,8 +28,8 @@ from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.rig.channels import CHANNELS
 from thermoctl.rig.signals import INDEX, POINTS, SIGNALS
-from thermoctl_hal.backend import ERROR, OK, ROLE, STALE
-from thermoctl_hal.drive_errors import describe
+from thermoctl_hal.base.backend import ERROR, OK, ROLE, STALE
+from thermoctl_hal.can.drive_errors import describe
 
 SENSORS = (
     "position_um",

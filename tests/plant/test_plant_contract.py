@@ -18,7 +18,7 @@ from thermoctl.plant.simulate import compile_plant
 from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.simulated import PlantRig
+from thermoctl_hal.simulated.rig import PlantRig
 
 BLOCK = """\
 format: thermoctl-plant/1

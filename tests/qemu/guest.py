@@ -20,11 +20,11 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(CHECKOUT), str(CHECKOUT / f".venv/lib/python3.{sys.version_info[1]}/site-packages")]
 
 from thermoctl import yamlfile  # noqa: E402
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
-from thermoctl_hal.binding import bind  # noqa: E402
-from thermoctl_hal.can_bus import LibraryPort, open_can  # noqa: E402
-from thermoctl_hal.devices import DevicesBackend  # noqa: E402
-from thermoctl_hal.drive import Cia402Device  # noqa: E402
+from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
+from thermoctl_hal.can.bus import LibraryPort, open_can  # noqa: E402
+from thermoctl_hal.can.drive import Cia402Device  # noqa: E402
+from thermoctl_hal.profiles.bind import bind  # noqa: E402
+from thermoctl_hal.rig.devices import DevicesBackend  # noqa: E402
 from thermoctl_hal.virtual.drive import DISABLED, ENABLED, Cia402Drive  # noqa: E402
 
 _FRAME = struct.Struct("=IB3x8s")
@@ -215,7 +215,7 @@ def heartbeat_lost() -> dict:
 
 def a_missing_interface_is_one_line() -> dict:
     """An interface that is not there, and one that is down: an error that says what to do."""
-    from thermoctl_hal.backend import HardwareError
+    from thermoctl_hal.base.backend import HardwareError
 
     messages = []
     for channel in ("can7", "vcan1"):

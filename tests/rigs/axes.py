@@ -17,7 +17,7 @@ from thermoctl.daemon.tick.assemble import compensator, law_parameters
 from thermoctl.daemon.tick.loop import Rig
 from thermoctl.daemon.tick.ring import Mailbox
 from thermoctl.rig.signals import AT, fault_word
-from thermoctl_hal.make import make_backends
+from thermoctl_hal.rig.make import make_backends
 
 NAMES = ("x", "y", "z", "u")
 

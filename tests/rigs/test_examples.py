@@ -11,7 +11,7 @@ import pytest
 from tests.hal.conftest import free_port
 from tests.rigs.axes import Axes
 from thermoctl.configuration.settings import load_rig
-from thermoctl_hal.make import make_backends
+from thermoctl_hal.rig.make import make_backends
 from thermoctl_hal.virtual.rig import VirtualRig
 
 pytestmark = pytest.mark.slow  # in real time: make test-wire

@@ -18,7 +18,7 @@ from tests.devices.emulators import Frame, ModbusLine, Port, SlcanAdapter, Unit,
 from tests.devices.test_drives import AXIS_DBC, POSITION_DRIVE, Drive, Positioner
 from tests.rigs.chain import plants
 from thermoctl.rig.channels import Channels, Point, of_points
-from thermoctl_hal.simulated import PlantRig, Surrounding
+from thermoctl_hal.simulated.rig import PlantRig, Surrounding
 
 PERIOD_S, AIR_C, WATCHDOG_S = 0.005, 22.0, 0.6
 READ = "rate_hz: 100, stale_after_s: 1"

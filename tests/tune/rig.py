@@ -14,7 +14,7 @@ import numpy as np
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.rig.channels import AT
-from thermoctl_hal.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
+from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, OK, Sample
 
 CONFIG = """\
 rig: {{name: loop}}
@@ -90,7 +90,7 @@ class Plant:
 
 
 class Backend:
-    """`thermoctl_hal.backend.Backend` over a Plant: encoder and amplifier, nothing else."""
+    """`thermoctl_hal.base.backend.Backend` over a Plant: encoder and amplifier, nothing else."""
 
     def __init__(self, truth, channels, seed):
         self.truth, self.plant, self.random = truth, Plant(truth), np.random.default_rng(seed)

@@ -19,7 +19,7 @@ from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.base.backend import HardwareError
 
 MODELS = Path("models")
 """Folder of calibrations where none is given; those of an axis are in a folder of its name below it."""

@@ -24,8 +24,8 @@ from thermoctl.daemon.control_socket import ask
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import HardwareError
-from thermoctl_hal.make import make_devices
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.rig.make import make_devices
 
 DrivenRig = SimulatedRig | DaemonRig
 

@@ -21,7 +21,7 @@ from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
-from thermoctl_hal.backend import HardwareError
+from thermoctl_hal.base.backend import HardwareError
 
 EVERY_S = 0.1  # between the rows that are kept
 READY_S = 20.0  # longest simulated time until the law is READY

@@ -28,7 +28,7 @@ from thermoctl.daemon.tick import arrival
 from thermoctl.daemon.tick.loop import RELOAD
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.make import can_drive
+from thermoctl_hal.rig.make import can_drive
 
 MAX_LINE = 65536  # bytes of one request
 MAX_CLIENTS = 32

@@ -22,10 +22,10 @@ from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.tick.shared import BEATS, RESUMED, WARNINGS, Shared
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import Backend, HardwareError
-from thermoctl_hal.board import Board
-from thermoctl_hal.make import make_backends, slow_devices
-from thermoctl_hal.poller import ports, run_poller
+from thermoctl_hal.base.backend import Backend, HardwareError
+from thermoctl_hal.rig.board import Board
+from thermoctl_hal.rig.make import make_backends, slow_devices
+from thermoctl_hal.rig.poller import ports, run_poller
 
 HANG_S = 15.0  # a helper without a round for this time is killed and started again
 STOP_S = 10.0  # a helper that does not end within this time after the request is killed

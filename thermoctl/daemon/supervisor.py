@@ -1,7 +1,7 @@
 """The supervisor: starts the daemon's processes, watches them, and disables the amplifier on every way out.
 
     supervisor ── loop        reads, controls, drives; alone and real-time
-              ├── poller      one for each slow device (thermoctl_hal.board.run_poller)
+              ├── poller      one for each slow device (thermoctl_hal.rig.board.run_poller)
               ├── recorder    ring -> recording
               ├── commands    the Unix socket
               ├── tuner       learns the expansion model, when compensation.tune is on
@@ -43,8 +43,8 @@ from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import check_mode, compensator, law_parameters, shared_name
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import HardwareError
-from thermoctl_hal.make import disable_amplifier
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.rig.make import disable_amplifier
 
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended

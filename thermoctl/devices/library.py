@@ -7,8 +7,8 @@ from pathlib import Path
 
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, suggest
-from thermoctl_hal.profile import Profile
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.base.profile import Profile
+from thermoctl_hal.profiles.read import load_profile
 
 EXIT_OK, EXIT_NONE = 0, 1
 FOLDERS = ("config/devices/library", "config/devices")

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from thermoctl.yamlfile import InputError
+from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.buses import BUSES
-from thermoctl_hal.key import REQUIRED, Key
-from thermoctl_hal.keys import TABLES
-from thermoctl_hal.read_profile import FORMAT, load_profile
+from thermoctl_hal.profiles.keys import TABLES
+from thermoctl_hal.profiles.read import FORMAT, load_profile
 
 EXIT_OK, EXIT_INPUT = 0, 2
 _TOP = ("vendor", "model", "manual", "edition", "place")

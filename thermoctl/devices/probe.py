@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from thermoctl.devices.library import find
-from thermoctl_hal.probe import Probe, raw_traffic, read_for
-from thermoctl_hal.read_profile import load_profile
+from thermoctl_hal.profiles.read import load_profile
+from thermoctl_hal.rig.probe import Probe, raw_traffic, read_for
 
 EXIT_OK, EXIT_PROBLEM = 0, 1
 

@@ -104,7 +104,7 @@ def simulated(work: Path, hours: float) -> list[Sample]:
 def drivers(bench: Bench, ticks: int) -> list[Sample]:
     """A sample every twentieth of the ticks."""
     from thermoctl.configuration.settings import load_settings
-    from thermoctl_hal.make import make_backend
+    from thermoctl_hal.rig.make import make_backend
 
     backend = make_backend(load_settings(bench.config))
     backend.open()

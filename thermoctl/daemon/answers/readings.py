@@ -18,7 +18,7 @@ from thermoctl.daemon.tick.ring import CODE, CODE_S, TRIPS
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.channels import ERROR, STALE, STATUS_NAMES, Channels
 from thermoctl.rig.signals import AT, Row, fault_word, of_recording, recorded_states
-from thermoctl_hal.drive_errors import describe
+from thermoctl_hal.can.drive_errors import describe
 
 
 def verdict(status: int, kind: float) -> str:

@@ -27,9 +27,9 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
-from thermoctl_hal.latency_timer import latency_timer_ms
-from thermoctl_hal.make import device_notes, fast_devices, make_backend, make_backends
+from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
+from thermoctl_hal.rig.make import device_notes, fast_devices, make_backend, make_backends
+from thermoctl_hal.serial.latency_timer import latency_timer_ms
 
 
 def check(settings: Settings) -> int:

@@ -20,7 +20,7 @@ from thermoctl.daemon.tick.assemble import compensator, law_parameters
 from thermoctl.daemon.tick.loop import RELOAD, Rig
 from thermoctl.daemon.tick.ring import Box, Mailbox
 from thermoctl.rig.signals import AT, fault_word
-from thermoctl_hal.make import make_backend
+from thermoctl_hal.rig.make import make_backend
 
 COMMANDS = {**{name: float(k) for k, name in enumerate(arming.COMMANDS)}, "reload": RELOAD}
 

@@ -30,7 +30,7 @@ def expected_hz(settings: Settings) -> dict[str, float]:
     """
     if settings.hal.backend != "devices":
         return {}
-    from thermoctl_hal.make import make_devices
+    from thermoctl_hal.rig.make import make_devices
 
     return {b.role: b.channel.rate_hz for d in make_devices(settings) for b in d.binding.bounds}
 

@@ -13,7 +13,7 @@ from thermoctl.configuration.settings import RigSettings, Settings
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.rig.channels import Channels
 from thermoctl.yamlfile import InputError, load
-from thermoctl_hal.binding import bind
+from thermoctl_hal.profiles.bind import bind
 
 UNNAMED = RigSettings().name
 

@@ -1,7 +1,7 @@
 # C types for loop.py, which is the tick; see there.
 cimport cython
 from libc.stdint cimport uint8_t
-from thermoctl_hal.devices cimport DevicesBackend
+from thermoctl_hal.rig.devices cimport DevicesBackend
 from thermoctl.control.law cimport Law
 from thermoctl.daemon.tick.clock cimport now_ns, sleep_until, suspended_ns, wall_s
 from thermoctl.daemon.tick.ring cimport Histogram, Mailbox, Record, Remarks, Ring

@@ -32,8 +32,8 @@ from thermoctl.daemon.tick.shared import LOOP_PID, START_S, Shared
 from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.rig.signals import AT as SIGNAL_AT
 from thermoctl.rig.signals import of_channels
-from thermoctl_hal.backend import ABSENT
-from thermoctl_hal.devices import DevicesBackend
+from thermoctl_hal.base.backend import ABSENT
+from thermoctl_hal.rig.devices import DevicesBackend
 
 RELOAD = float(len(arming.COMMANDS))
 """The mailbox command that applies the parameter block; the others are arming's."""

@@ -1,0 +1,407 @@
+# cython: annotation_typing=False, cdivision=True
+"""CAN ports that the tick can use without waiting.
+
+A port is written "interface:channel@bitrate,second"; the default bitrate is 1000000.
+
+    slcan:/dev/serial/by-id/...   Lawicel ASCII on a serial port, read and written on the bare descriptor
+                                  (python-can's own slcan reads one byte a call, 150 us a frame). `second`
+                                  is the baud rate of the adapter's serial side (3000000)
+    socketcan:can0                python-can opens it and sets the kernel's filters; frames pass on the socket
+    virtual:name, others          through python-can; a thread reads an interface whose receive may block.
+                                  `second` is the data bitrate of CAN FD; without it the bus is classic
+
+Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
+number. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
+`long_frames`: a device that does not expect them never sees them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import struct
+import threading
+from collections import deque
+from typing import Any
+
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.profile import LineSettings
+from thermoctl_hal.base.wire import EXTENDED, CanPort, SlcanLine
+from thermoctl_hal.serial.line import open_port
+
+MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
+READ_S = 0.1  # between looks of a reading thread at its end
+MAX_REFUSED = 100  # the bus counts as lost after so many refused frames in a row
+_SLCAN_BITRATES = {
+    10_000: 0,
+    20_000: 1,
+    50_000: 2,
+    100_000: 3,
+    125_000: 4,
+    250_000: 5,
+    500_000: 6,
+    800_000: 7,
+    1_000_000: 8,
+}
+SLCAN_BAUD = 3_000_000
+SHARED = ("socketcan", "virtual", "udp_multicast")  # any number of programs and devices may open these
+NEVER_BLOCK = ("virtual", "udp_multicast")  # interfaces whose recv(0) returns at once
+_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
+_FD_FRAME = struct.Struct("=IB3x64s")  # struct canfd_frame
+_REMOTE, _ERROR_FLAG, _BUS_OFF = 0x4000_0000, 0x2000_0000, 0x40
+
+
+NO_FD = (
+    "the device takes CAN FD frames: give an interface with a data bitrate, as socketcan:can0@1000000,5000000"
+)
+
+
+class SlcanPort(SlcanLine):
+    """A Lawicel adapter on a serial port, opened with its bitrate set."""
+
+    def __init__(self, path: str, bitrate: int, baud: int = SLCAN_BAUD) -> None:
+        if bitrate not in _SLCAN_BITRATES:
+            raise HardwareError(
+                f"slcan:{path}: bitrate {bitrate} is not one of {', '.join(map(str, _SLCAN_BITRATES))}"
+            )
+        self._port = open_port(path, LineSettings(baud=baud))
+        super().__init__(self._port.fileno())
+        os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
+
+    @property
+    def bad(self) -> int:
+        """Count lines that are no frame, and frames that the adapter refused."""
+        return self.parser.bad + self.parser.refused
+
+    @property
+    def ignored(self) -> int:
+        """Count remote frames and CAN FD frames."""
+        return self.parser.ignored
+
+    def send_long(self, can_id: int, data: bytes) -> None:
+        """Refuse a CAN FD frame. Raises HardwareError."""
+        raise HardwareError(NO_FD)
+
+    def close(self) -> None:
+        """Close the channel and the line."""
+        with contextlib.suppress(OSError):
+            os.write(self._port.fileno(), b"C\r")
+        with contextlib.suppress(OSError):
+            self._port.close()
+
+
+class LibraryPort(CanPort):
+    """An interface opened by python-can; SocketCAN frames pass on the bare socket."""
+
+    def __init__(
+        self, interface: str, channel: str, bitrate: int, ids: tuple[int, ...], data_bitrate: int = 0
+    ) -> None:
+        import can  # takes a second; rigs on slcan do not need it
+
+        self._library: Any = can
+        in_kernel = [_kernel_filter(i) for i in ids] if interface == "socketcan" and ids else None
+        self._wanted = None if in_kernel or not ids else frozenset(ids)
+        self._bus: Any
+        self._is_fd = bool(data_bitrate)
+        fd: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if data_bitrate else {}
+        try:
+            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel, **fd)
+        except (can.CanError, OSError, ValueError, ImportError) as e:
+            raise HardwareError(
+                f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
+                f"{channel} up type can bitrate {bitrate})?"
+            ) from None
+        self._socket: Any = self._bus.socket if interface == "socketcan" else None
+        if self._socket is not None:
+            self._socket.setblocking(False)
+        self.bad = self.ignored = self._pending = 0
+        self._long: list[tuple[int, bytes]] = []
+        self._arrived: deque[Any] | None = None
+        self._closing = threading.Event()
+        self._reader: threading.Thread | None = None
+        if self._socket is None and interface not in NEVER_BLOCK:
+            self._arrived = deque(maxlen=MAX_TAKEN)
+            self._reader = threading.Thread(target=self._read_on, daemon=True, name=f"read {channel}")
+            self._reader.start()
+
+    def _read_on(self) -> None:
+        """Receive in a thread; an error is handed on as the last item."""
+        arrived = self._arrived
+        while arrived is not None and not self._closing.is_set():
+            try:
+                message = self._bus.recv(READ_S)
+            except Exception as e:  # interfaces of python-can raise errors of their own
+                if not self._closing.is_set():
+                    arrived.append(e)
+                return
+            if message is not None:
+                arrived.append(message)
+
+    def flush(self) -> int:
+        """Send the queued frames, without waiting. Raises OSError when the bus is gone or full."""
+        for can_id, data in self.queued():
+            try:
+                self._send(can_id, data)
+                self._pending = 0
+            except (BlockingIOError, self._library.CanError) as e:
+                self._queue_full(e)
+            except OSError as e:
+                if e.errno != errno.ENOBUFS:
+                    raise
+                self._queue_full(e)
+            except Exception as e:  # interfaces of python-can raise errors of their own
+                raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+        return 0
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        if self._socket is not None:
+            self._socket.send(_FRAME.pack(can_id, len(data), data))
+            return
+        extended = bool(can_id & EXTENDED)
+        message = self._library.Message
+        self._bus.send(message(arbitration_id=can_id & ~EXTENDED, data=data, is_extended_id=extended))
+
+    def send_long(self, can_id: int, data: bytes) -> None:
+        """Send a CAN FD frame at the data bitrate. Raises OSError, HardwareError."""
+        if not self._is_fd:
+            raise HardwareError(NO_FD)
+        extended = bool(can_id & EXTENDED)
+        message = self._library.Message(
+            arbitration_id=can_id & ~EXTENDED,
+            data=data,
+            is_extended_id=extended,
+            is_fd=True,
+            bitrate_switch=True,
+        )
+        try:
+            self._bus.send(message)
+        except OSError:
+            raise
+        except Exception as e:  # interfaces of python-can raise errors of their own
+            raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+
+    def _queue_full(self, why: Exception) -> None:
+        self.bad += 1
+        self._pending += 1
+        if self._pending > MAX_REFUSED:
+            raise OSError(errno.ENOBUFS, f"nobody on the bus takes frames ({why})")
+
+    def take(self) -> int:
+        """Take the frames that have arrived; return how many.
+
+        Raises OSError: interface down; HardwareError: bus-off."""
+        self.begin()
+        take = self._take_message if self._socket is None else self._take_raw
+        taken = 0
+        while taken < MAX_TAKEN and (found := take()) >= 0:
+            taken += found
+        return taken
+
+    def _take_message(self) -> int:
+        """Take the library's next message; 1 when it was delivered, 0 when not, -1 when there is none."""
+        message = self._receive()
+        if message is None:
+            return -1
+        can_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        if message.is_error_frame:
+            self.bad += 1
+        elif message.is_remote_frame:
+            self.ignored += 1
+        elif self._wanted is None or can_id in self._wanted:
+            return self._sort(can_id, bytes(message.data), message.is_fd)
+        return 0
+
+    def _sort(self, can_id: int, data: bytes, is_fd: bool) -> int:
+        """Deliver a frame, or keep it for `long_frames`; 1 when it was delivered."""
+        if not is_fd:
+            return int(self.deliver(can_id, data))
+        if len(self._long) < MAX_TAKEN:
+            self._long.append((can_id, data))
+        return 0
+
+    def long_frames(self) -> list[tuple[int, bytes]]:
+        """Return the CAN FD frames that have arrived, and forget them."""
+        found, self._long = self._long, []
+        return found
+
+    def _take_raw(self) -> int:
+        """Take the next frame of the kernel's socket; the result is that of `_take_message`."""
+        try:
+            raw = self._socket.recv(_FD_FRAME.size)
+        except BlockingIOError:
+            return -1
+        if len(raw) not in (_FRAME.size, _FD_FRAME.size):
+            self.ignored += 1
+            return 0
+        is_fd = len(raw) == _FD_FRAME.size
+        raw_id, size, data = (_FD_FRAME if is_fd else _FRAME).unpack(raw)
+        if raw_id & _ERROR_FLAG:
+            self.bad += 1
+            if raw_id & _BUS_OFF:
+                raise HardwareError("CAN bus-off: check wiring, termination and bitrate")
+            return 0
+        if raw_id & _REMOTE:
+            self.ignored += 1
+            return 0
+        return self._sort(raw_id, data[:size], is_fd)
+
+    def _receive(self) -> Any:
+        """Return the library's next message, or None. Raises OSError when the interface failed."""
+        if self._arrived is not None:
+            found = self._arrived.popleft() if self._arrived else None
+            if isinstance(found, Exception):
+                raise OSError(errno.EIO, f"{type(found).__name__}: {found}")
+            return found
+        try:
+            return self._bus.recv(0)
+        except OSError:
+            raise
+        except Exception as e:
+            raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._closing.set()
+        if self._reader is not None:
+            self._reader.join(1.0)
+        with contextlib.suppress(Exception):  # interfaces of python-can raise errors of their own
+            self._bus.shutdown()
+
+
+def _kernel_filter(can_id: int) -> dict[str, int | bool]:
+    extended = bool(can_id & EXTENDED)
+    mask = 0x1FFF_FFFF if extended else 0x7FF
+    return {"can_id": can_id & ~EXTENDED, "can_mask": mask, "extended": extended}
+
+
+class Hub:
+    """An adapter that several devices of this process share; each has a `SharedPort`."""
+
+    def __init__(self, port: str, adapter: SlcanPort | LibraryPort) -> None:
+        self.port, self.adapter, self.broken = port, adapter, False
+        self.ports: list[SharedPort] = []
+        self.lock = threading.Lock()
+
+    def pump(self) -> None:
+        """Hand the frames that have arrived to the ports that want them.
+
+        While another thread sets a device up, its own pump does this. Raises OSError, HardwareError."""
+        if self.broken:
+            raise OSError(errno.EIO, f"{self.port} was lost")
+        if not self.lock.acquire(blocking=False):
+            return
+        try:
+            for can_id, data in self.adapter.receive():
+                for port in self.ports:
+                    if can_id in port.ids:
+                        port.inbox.append((can_id, data))
+            for can_id, data in self.adapter.long_frames():
+                for port in self.ports:
+                    if can_id in port.ids:
+                        port.long_inbox.append((can_id, data))
+        except (OSError, HardwareError):
+            self.broken = True
+            raise
+        finally:
+            self.lock.release()
+
+    def send(self, frames: list[tuple[int, bytes]]) -> None:
+        """Send frames. Raises OSError."""
+        if self.broken:
+            raise OSError(errno.EIO, f"{self.port} was lost")
+        with self.lock:
+            try:
+                self.adapter.send(*frames)
+            except OSError:
+                self.broken = True
+                raise
+
+
+class SharedPort(CanPort):
+    """The part of a shared adapter that one device sees: the frames with its `ids`."""
+
+    def __init__(self, hub: Hub, ids: tuple[int, ...]) -> None:
+        self.hub, self.ids = hub, frozenset(ids)
+        self.inbox: deque[tuple[int, bytes]] = deque(maxlen=MAX_TAKEN)
+        self.long_inbox: deque[tuple[int, bytes]] = deque(maxlen=MAX_TAKEN)
+
+    @property
+    def bad(self) -> int:
+        """Count the adapter's bad frames."""
+        return int(self.hub.adapter.bad)
+
+    @property
+    def ignored(self) -> int:
+        """Count the frames that the adapter ignored."""
+        return int(self.hub.adapter.ignored)
+
+    def take(self) -> int:
+        """Take this device's frames; return how many. Raises OSError, HardwareError."""
+        self.hub.pump()
+        self.begin()
+        taken = 0
+        while self.inbox:
+            can_id, data = self.inbox.popleft()
+            taken += self.deliver(can_id, data)
+        return taken
+
+    def long_frames(self) -> list[tuple[int, bytes]]:
+        """Return the CAN FD frames that have arrived, and forget them."""
+        found = list(self.long_inbox)
+        self.long_inbox.clear()
+        return found
+
+    def flush(self) -> int:
+        """Send the queued frames. Raises OSError."""
+        self.hub.send(self.queued())
+        return 0
+
+    def send_long(self, can_id: int, data: bytes) -> None:
+        """Send a CAN FD frame. Raises OSError, HardwareError."""
+        with self.hub.lock:
+            self.hub.adapter.send_long(can_id, data)
+
+    def close(self) -> None:
+        """End the use of the adapter; its last user closes it."""
+        with _LOCK:
+            if self in self.hub.ports:
+                self.hub.ports.remove(self)
+            if not self.hub.ports:
+                self.hub.adapter.close()
+                if _HUBS.get(self.hub.port) is self.hub:
+                    del _HUBS[self.hub.port]
+
+
+_HUBS: dict[str, Hub] = {}
+_LOCK = threading.Lock()
+AnyPort = SlcanPort | LibraryPort | SharedPort
+_PORT = re.compile(r"(\w+):(.+?)(?:@(\d+)(?:,(\d+))?)?")
+
+
+def open_can(port: str, ids: tuple[int, ...], shared: bool = False) -> AnyPort:
+    """Open "interface:channel@bitrate,second" for the frames `ids`.
+
+    shared: other devices of this process use the adapter, too. Raises HardwareError."""
+    if not shared:
+        return _open(port, ids)
+    with _LOCK:
+        hub = _HUBS.get(port)
+        if hub is None or hub.broken:
+            hub = _HUBS[port] = Hub(port, _open(port, ()))
+        view = SharedPort(hub, ids)
+        hub.ports.append(view)
+        return view
+
+
+def _open(port: str, ids: tuple[int, ...]) -> SlcanPort | LibraryPort:
+    match = _PORT.fullmatch(port)
+    if match is None:
+        raise HardwareError(
+            f"port '{port}': interface:channel@bitrate was expected, as slcan:/dev/ttyACM0@1000000"
+        )
+    bitrate, second = int(match[3] or 1_000_000), int(match[4] or 0)
+    if match[1] == "slcan":
+        return SlcanPort(match[2], bitrate, second or SLCAN_BAUD)
+    return LibraryPort(match[1], match[2], bitrate, ids, second)

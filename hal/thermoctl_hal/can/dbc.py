@@ -1,0 +1,152 @@
+"""CAN devices that a DBC file describes: sensors, which are only listened to, and amplifiers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from thermoctl_hal.base.amplifier import Commanded
+from thermoctl_hal.base.backend import HardwareError, Sample
+from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.device import Device
+from thermoctl_hal.base.message import can_frame
+from thermoctl_hal.base.profile import Assumed, Dbc, DbcSource, Message, typed
+from thermoctl_hal.base.wire import EXTENDED
+from thermoctl_hal.can.bus import AnyPort, open_can
+
+if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can import Message as DbcMessage
+
+CLASSIC_BYTES = 8  # of a frame that is not CAN FD
+
+
+class DbcDevice(Device):
+    """A sensor whose messages a DBC file describes; nothing is sent to it."""
+
+    def __init__(self, binding: Binding) -> None:
+        super().__init__(binding)
+        spec = self._spec = typed(binding.profile.bus_spec, Dbc)
+        self._port: AnyPort | None = None
+        self._messages: dict[int, tuple[DbcMessage, list[tuple[int, DbcSource]], list[str]]] = {}
+        """CAN id -> the message, its bound channels, the names of signals that say whether they are good."""
+        self._fd_ignored = 0
+        self._quiet, self._why = 0, ""  # frames since the last reading, and why the last of them gave none
+        for i, b in enumerate(binding.bounds):
+            if isinstance(b.channel.source, Assumed):
+                continue
+            source = typed(b.channel.source, DbcSource)
+            message = spec.database.get_message_by_name(source.message)
+            can_id = spec.can_id(source.message, binding.address)
+            entry = self._messages.setdefault(can_id, (message, [], []))
+            entry[1].append((i, source))
+            if source.invalid is not None:
+                entry[2].append(source.invalid.field)
+
+    def connect(self) -> None:
+        """Open the port."""
+        self._port = open_can(self.binding.port, tuple(self._messages), self.binding.shared)
+        self._quiet = 0
+
+    def disconnect(self) -> None:
+        """Close the port."""
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Decode the frames that have arrived. `silence` reports those that do not decode."""
+        port = self._port
+        if port is None:
+            raise HardwareError("not connected")
+        for can_id, data in port.receive():
+            self._take(sample, can_id, data, now_s)
+        for can_id, data in port.long_frames():
+            entry = self._messages.get(can_id)
+            if entry is not None and (entry[0].is_fd or entry[0].length > CLASSIC_BYTES):
+                self._take(sample, can_id, data, now_s)
+            else:
+                self._fd_ignored += 1
+
+    def _take(self, sample: Sample, can_id: int, data: bytes, now_s: float) -> None:
+        """Store the readings of a frame."""
+        entry = self._messages.get(can_id)
+        if entry is None:
+            self._quiet += 1
+            if can_id ^ EXTENDED in self._messages:
+                here, there = (29, 11) if can_id & EXTENDED else (11, 29)
+                self._why = f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
+            return
+        try:
+            values: Mapping[str, Any] = entry[0].decode_simple(data, decode_choices=False, scaling=True)
+            readings = [(i, s, float(values[s.signal])) for i, s in entry[1] if s.signal in values]
+            raws: Mapping[str, Any] = (
+                entry[0].decode_simple(data, decode_choices=False, scaling=False) if entry[2] else {}
+            )
+        except Exception as e:  # foreign bytes may raise anything in the library
+            self.counts["errors"] += 1
+            self._quiet += 1
+            self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
+            return
+        self.counts["frames"] += 1
+        for i, source, value in readings:
+            self._quiet, self._why = 0, ""
+            test = source.invalid
+            if value in source.sentinels:
+                self.fail(sample, i, f"{source.signal} is {value:g}: no reading")
+            elif test is not None and int(raws.get(test.field, test.value)) & test.mask != test.value:
+                self.fail(
+                    sample, i, f"{test.field} is 0x{int(raws[test.field]):X}: the device reports a fault"
+                )
+            else:
+                self.put(sample, i, value, now_s)
+
+    def silence(self) -> str:
+        """Say what arrives instead of a reading."""
+        wanted = ", ".join(f"0x{i & ~EXTENDED:X} ({29 if i & EXTENDED else 11} bits)" for i in self._messages)
+        if self._quiet:
+            return f"{self._quiet} frames came and gave no reading: {self._why or f'none is {wanted}'}"
+        ignored = self.counters().get("ignored", 0)
+        if ignored:
+            return f"{ignored} remote or CAN FD frames came, {wanted} as classic data frame is wanted"
+        return f"{super().silence()}, the bitrate, and who sends {wanted}"
+
+    def counters(self) -> dict[str, int]:
+        """Return frames, errors (frames that did not decode), ignored frames, reconnections."""
+        if self._port is not None:
+            self.counts["ignored"] = self._port.ignored + self._fd_ignored
+        return self.counts
+
+
+class DbcDrive(Commanded, DbcDevice):
+    """An amplifier that takes messages of a DBC file."""
+
+    def __init__(self, binding: Binding) -> None:
+        DbcDevice.__init__(self, binding)
+        self.prepare()
+
+    def send_message(self, message: Message, command: float) -> None:
+        """Send one message. Raises OSError."""
+        if self._port is None:
+            raise HardwareError("not connected")
+        can_id, data = can_frame(message, self._spec, command, self.binding.address)
+        if len(data) > CLASSIC_BYTES:
+            self._port.send_long(can_id, data)
+        else:
+            self._port.send((can_id, data))
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Decode the frames that have arrived."""
+        super().read(sample, now_s)
+        if self.is_assumed:
+            self.put(sample, self.state_bound, 0.0, now_s)
+
+    def switch_off(self) -> None:
+        """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
+        super().connect()
+        self.sequencer.restart()
+        sample = Sample(len(self.binding.channels.names))
+        try:
+            self.confirm_off(lambda: self.read(sample, time.monotonic()))
+        finally:
+            super().disconnect()

@@ -1,0 +1,97 @@
+"""Read the parts of a profile about Modbus devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from thermoctl.yamlfile import Section, number_of
+from thermoctl_hal.base.key import take
+from thermoctl_hal.base.profile import (
+    BIT_KINDS,
+    REGISTER_TYPES,
+    WORD_BYTES,
+    BusSpec,
+    Condition,
+    Modbus,
+    Register,
+    typed,
+)
+from thermoctl_hal.modbus.keys import MODBUS
+
+REGISTERS = 65536  # addresses of a Modbus unit
+_WORD_BITS = 8 * WORD_BYTES
+_MANUAL_BASES = ((30001, "input"), (40001, "holding"))
+_MANUAL_REGISTERS = 9999
+"""Manuals often number input registers 30001..39999 and holding registers 40001..49999, from address 0."""
+
+
+def read_modbus(top: Section, folder: Path) -> Modbus:
+    """Read `modbus`."""
+    s = top.section("modbus")
+    k = take(s, MODBUS["modbus"])
+    s.end()
+    return Modbus(**k)
+
+
+def read_register(s: Section, spec: BusSpec) -> Register:
+    """Read the place of a channel of a Modbus device: registers, a coil or a discrete input."""
+    k = take(s, MODBUS["channel of modbus"])
+    sentinels = tuple(number_of(n, "sentinels") for n in k["sentinels"] or ())
+    invalid = _invalid(k["invalid"])
+    if k["kind"] in BIT_KINDS:
+        for key in ("type", "word_order", "byte_order", "low_bit", "bits"):
+            if (node := s.get(key, False)) is not None:
+                raise node.error(f"{key}: a {k['kind']} is one bit and has none")
+        return Register(k["kind"], k["register"], "bit", sentinels=sentinels, invalid=invalid)
+    types = [t for t in REGISTER_TYPES if t != "bit"]
+    source = Register(
+        k["kind"],
+        k["register"],
+        s.text("type", "int16", types),
+        k["word_order"],
+        sentinels,
+        k["byte_order"],
+        (k["low_bit"], k["bits"]),
+        k["signed"],
+        invalid,
+    )
+    if source.address + source.words > REGISTERS or source.words > typed(spec, Modbus).max_block:
+        raise s.node.error(f"register: {source.words} registers from {source.address} do not fit")
+    _check_bits(s, k, source)
+    return source
+
+
+def _check_bits(s: Section, k: dict[str, Any], source: Register) -> None:
+    if (k["bits"] or k["low_bit"] or k["signed"]) and (
+        not 1 <= k["bits"] <= source.words * _WORD_BITS - k["low_bit"] or "int" not in source.type
+    ):
+        raise s.node.error(
+            f"{s.what}: {k['bits']} bits from bit {k['low_bit']} are not inside a {source.type}; "
+            "'low_bit', 'bits' and 'signed' say which bits of a whole number hold the value"
+        )
+
+
+def _invalid(s: Section | None) -> tuple[Register, Condition] | None:
+    if s is None:
+        return None
+    k = take(s, MODBUS["invalid of modbus"])
+    s.end()
+    if k["kind"] in BIT_KINDS:
+        register, mask = Register(k["kind"], k["register"], "bit"), 1
+    else:
+        register, mask = Register(k["kind"], k["register"], "uint16"), k["mask"]
+    if k["good"] & ~mask:
+        raise s.get("good").error(f"good: {k['good']} has bits outside mask {mask:#x}")
+    return register, Condition("", mask, k["good"])
+
+
+def register_hint(address: int) -> str:
+    """Return the kind and address meant by a manual that counts registers from 30001 or 40001, else ''."""
+    for base, kind in _MANUAL_BASES:
+        if base <= address < base + _MANUAL_REGISTERS:
+            return (
+                f"addresses count from 0; where the manual calls it {address}, it is kind: {kind}, "
+                f"register: {address - base}"
+            )
+    return ""

@@ -1,0 +1,98 @@
+"""Polling of slow devices, in a process or a thread of its own; the readings go to a board."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterable
+
+from thermoctl_hal.base.backend import STALE, HardwareError, Sample
+from thermoctl_hal.base.binding import port_key
+from thermoctl_hal.base.device import Device
+from thermoctl_hal.base.profile import Assumed
+from thermoctl_hal.rig.board import Board
+
+RECONNECT_S = 0.25  # between attempts to open a device that is gone
+COMMAND_AGE_S = 0.25  # an amplifier is disabled when the loop's last command is older
+
+
+def ports(devices: Iterable[Device]) -> list[list[Device]]:
+    """Group slow devices by their port: those of a group are polled in turn."""
+    groups: dict[str, list[Device]] = {}
+    for device in devices:
+        groups.setdefault(port_key(device.binding.port), []).append(device)
+    return list(groups.values())
+
+
+def poll_until(devices: list[Device], board: Board, stop: threading.Event) -> None:
+    """Poll the slow devices of a port and post to the board, until `stop` is set.
+
+    Each is polled at its fastest channel's rate; the longest overdue comes next. A device that is gone is
+    connected again, and its last values are kept until they are stale."""
+    period_s = {d: 1.0 / _rate_hz(d) for d in devices}
+    samples = {d: Sample(len(d.binding.channels.names)) for d in devices}
+    due_s = dict.fromkeys(devices, time.monotonic())
+    for device in devices:
+        samples[device].status[device.roles] = STALE
+    while not stop.is_set():
+        device = min(devices, key=lambda d: due_s[d])
+        if stop.wait(max(0.0, due_s[device] - time.monotonic())):
+            break
+        _poll(device, samples[device], board)
+        board.post(samples[device], device)
+        due_s[device] += period_s[device] if device.up else RECONNECT_S
+        due_s[device] = max(due_s[device], time.monotonic())  # a slow answer: drop the polls that were missed
+    for device in devices:
+        if device.drives and not device.up:
+            with contextlib.suppress(HardwareError, OSError):
+                device.switch_off()
+        device.up = False
+        device.disconnect()  # disables an amplifier that is up
+
+
+def _rate_hz(device: Device) -> float:
+    amplifier = device.binding.profile.amplifier
+    rates = [b.channel.rate_hz for b in device.binding.bounds if not isinstance(b.channel.source, Assumed)]
+    return max(rates + ([amplifier.command_hz] if amplifier is not None else []))
+
+
+def _poll(device: Device, sample: Sample, board: Board) -> None:
+    try:
+        if not device.up:
+            device.connect()
+            device.up = True
+        device.poll(sample)
+        if device.drives:
+            drive, enable, sent_s = board.command(device)
+            now_s = time.monotonic()
+            is_fresh = now_s - sent_s <= COMMAND_AGE_S
+            device.write(drive if is_fresh else 0.0, enable and is_fresh, now_s)
+    except (HardwareError, OSError) as e:
+        if device.up:
+            device.counts["reconnections"] += 1
+        device.up = False
+        device.disconnect()
+        if device.drives:
+            device.fail_all(sample, f"{e}; reconnecting")
+        device.miss_all(f"{e}; reconnecting")
+
+
+def run_poller(devices: list[Device], board_name: str) -> None:
+    """Run a poller process for the devices of a port, until SIGTERM or until the parent is gone."""
+    board = Board.attach(board_name)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the group; the supervisor stops us
+    parent = os.getppid()
+
+    def watch_parent() -> None:
+        """Set `stop` within 0.5 s after the parent process has ended."""
+        while not stop.wait(0.5):
+            if os.getppid() != parent:
+                stop.set()
+
+    threading.Thread(target=watch_parent, daemon=True).start()
+    poll_until(devices, board, stop)

@@ -1,0 +1,49 @@
+"""Amplifiers on a serial line of their own: binary frames or text lines carry the command."""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+
+from thermoctl_hal.base.amplifier import Commanded
+from thermoctl_hal.base.backend import HardwareError, Sample
+from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.message import serial_bytes
+from thermoctl_hal.base.profile import Message
+from thermoctl_hal.serial.port import SerialDevice
+
+
+class SerialDrive(Commanded, SerialDevice):
+    """An amplifier on a serial line."""
+
+    def __init__(self, binding: Binding) -> None:
+        SerialDevice.__init__(self, binding)
+        self.prepare()
+
+    def send_message(self, message: Message, command: float) -> None:
+        """Send one message. Raises OSError."""
+        data = serial_bytes(message, command, self.binding.address)
+        if self._fd < 0:
+            raise HardwareError("not connected")
+        try:
+            written = os.write(self._fd, data)
+        except BlockingIOError:
+            written = 0
+        if written < len(data):
+            raise OSError(errno.ENOBUFS, "the line takes no data: is command_hz too high for its baud rate?")
+
+    def read(self, sample: Sample, now_s: float) -> None:
+        """Take what has arrived."""
+        super().read(sample, now_s)
+        if self.is_assumed:
+            self.put(sample, self.state_bound, 0.0, now_s)
+
+    def switch_off(self) -> None:
+        """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
+        self.connect()
+        sample = Sample(len(self.binding.channels.names))
+        try:
+            self.confirm_off(lambda: self.read(sample, time.monotonic()))
+        finally:
+            SerialDevice.disconnect(self)

@@ -1,0 +1,115 @@
+"""Serial ports, and the lines of text that arrive on them.
+
+Ports: "/dev/serial/by-id/..." or "socket://host:port", a serial line behind a network adapter. pyserial opens
+and configures the line, exclusively, so that a second program is refused. The tick then reads and writes the
+bare descriptor without waiting.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import socket
+import termios
+
+import serial
+
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.profile import LineSettings
+from thermoctl_hal.serial.latency_timer import set_latency_timer
+
+NETWORK = "socket://"
+CONNECT_S = 3.0  # longest time to connect to a network adapter
+MAX_LINE = 1024  # a text line longer than this is garbage
+_CHARACTERS = 6  # place of the special characters in termios' list
+
+
+class LineReader:
+    """Bytes in, lines out; a line that is too long is dropped up to its end.
+
+    end: the bytes that end a line; empty: CR, LF or both."""
+
+    def __init__(self, end: bytes = b"") -> None:
+        self._end = end
+        self._buffer = bytearray()
+        self._dropping = False
+        self.bad = 0
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return the lines that `data` completes, in order, without their ends."""
+        self._buffer += data
+        text = bytes(self._buffer)
+        *lines, rest = text.split(self._end) if self._end else text.replace(b"\r", b"\n").split(b"\n")
+        if lines and self._dropping:
+            lines, self._dropping = lines[1:], False
+        if len(rest) > MAX_LINE:
+            self.bad += not self._dropping
+            rest, self._dropping = b"", True
+        self._buffer[:] = rest
+        return [line for line in lines if 0 < len(line) <= MAX_LINE]
+
+    @property
+    def pending(self) -> int:
+        """Count the bytes of a line that has no end yet."""
+        return MAX_LINE if self._dropping else len(self._buffer)
+
+    def reset(self) -> None:
+        """Drop an incomplete line."""
+        self._buffer.clear()
+        self._dropping = False
+
+
+def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
+    """Open a serial port exclusively, or socket://host:port, non-blocking.
+
+    Raises HardwareError with the remedy."""
+    if path.startswith(NETWORK):
+        return _open_socket(path)
+    try:
+        port = serial.Serial(
+            path,
+            line.baud,
+            bytesize=line.data_bits,
+            parity=line.parity,
+            stopbits=line.stop_bits,
+            timeout=0,
+            write_timeout=0,
+            exclusive=True,
+        )
+    except (OSError, ValueError, termios.error) as e:
+        code = getattr(e, "errno", None)
+        hint = {
+            errno.ENOENT: "no such device: is it plugged in? prefer a name of /dev/serial/by-id",
+            errno.EACCES: "permission denied: add the user to the group of the device (dialout)",
+            errno.EAGAIN: "in use by another program: stop it first",
+            errno.EBUSY: "in use by another program: stop it first",
+            errno.EINVAL: f"cannot do {line.baud} baud, parity {line.parity}: see the profile's 'line'",
+        }.get(code or 0, str(e))
+        raise HardwareError(f"{path}: {hint}") from None
+    if line.latency_timer_ms:
+        set_latency_timer(path, line.latency_timer_ms)
+    try:
+        settings = termios.tcgetattr(port.fileno())
+        settings[_CHARACTERS][termios.VMIN] = 1  # 'nothing yet' is EAGAIN, so that no bytes mean 'gone'
+        termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
+        termios.tcflush(port.fileno(), termios.TCIOFLUSH)
+        os.set_blocking(port.fileno(), False)
+    except (OSError, termios.error) as e:  # unplugged meanwhile; termios.error is no OSError
+        port.close()
+        raise HardwareError(f"{path}: gone while it was opened ({e})") from None
+    return port
+
+
+def _open_socket(path: str) -> socket.socket:
+    found = re.fullmatch(r"socket://(\[[^]]+\]|[^:/]+):(\d+)/?", path)
+    if found is None:
+        raise HardwareError(f"port '{path}': socket://host:port was expected")
+    try:
+        port = socket.create_connection((found[1].strip("[]"), int(found[2])), CONNECT_S)
+        port.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        port.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        port.setblocking(False)
+    except (OSError, OverflowError) as e:
+        raise HardwareError(f"{path}: {e}: check power, network and address") from None
+    return port
