@@ -8,7 +8,7 @@ from pathlib import Path
 
 import shtab
 
-from thermoctl import __version__
+from thermoctl import __version__, safe_file
 from thermoctl.yamlfile import InputError
 
 PLACES = {  # places below the root where man and the shells look for local files
@@ -16,6 +16,7 @@ PLACES = {  # places below the root where man and the shells look for local file
     "bash": "usr/local/share/bash-completion/completions/thermoctl",
     "zsh": "usr/local/share/zsh/site-functions/_thermoctl",
 }
+REMEDY = "run it as root, or give --root"
 _FILES = (
     ("$THERMOCTL_CONFIG", "configuration, when --config is not given"),
     ("config/simulated.yaml", "the one of the simulated rig, used where neither is given"),
@@ -101,13 +102,8 @@ def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Pat
     written = []
     for kind, place in PLACES.items():
         path = Path(root, place)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(texts[kind])
-        except OSError as e:
-            raise InputError(
-                f"{path}: cannot be written: {e.strerror}; run it as root, or give --root"
-            ) from None
+        safe_file.make_folder(path.parent, REMEDY)
+        safe_file.write_text(path, texts[kind], REMEDY)
         written.append(path)
     return written
 

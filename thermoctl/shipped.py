@@ -11,6 +11,7 @@ import site
 import sys
 from pathlib import Path
 
+from thermoctl.safe_file import whole_files
 from thermoctl.yamlfile import InputError
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
@@ -42,11 +43,9 @@ def init(folder: str) -> int:
         target = Path(folder) / name
         if target.exists():
             raise InputError(f"{target}: exists already and is kept; give another folder")
-    for source, name in COPIED.items():
-        target = Path(folder) / name
-        try:
-            shutil.copytree(shipped(source), target)
-        except OSError as e:
-            raise InputError(f"{target}: cannot be written: {e}") from None
-        print(f"wrote {target}")
+    with whole_files(folder) as part:
+        for source, name in COPIED.items():
+            shutil.copytree(shipped(source), part / name)
+    for name in COPIED.values():
+        print(f"wrote {Path(folder) / name}")
     return 0

@@ -20,6 +20,7 @@ from thermoctl.configuration.settings import Settings, effective
 from thermoctl.daemon.service import log_path
 from thermoctl.recording.reader import export, info
 from thermoctl.recording.writer import FULL, recording_files
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 
 LOG_BYTES = 1_000_000  # from the log's end
@@ -63,21 +64,19 @@ def report(settings: Settings, out: str, seconds: float) -> int:
     newest = _newest(recording_files(folder, FULL) if folder.is_dir() else [])
     if newest is None:
         missing.append(f"no recording in {folder}")
-    try:
-        with (
-            tempfile.TemporaryDirectory() as work,
-            zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive,
-        ):
-            for name, text in files.items():
-                archive.writestr(name, text)
-            if newest is not None:
-                path, ends_s = newest
-                part = Path(work) / f"{path.stem}.parquet"
-                export(path, part, begin_s=ends_s - seconds)
-                archive.write(part, part.name)
-            names = archive.namelist()
-    except OSError as e:
-        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
+    with (
+        tempfile.TemporaryDirectory() as work,
+        whole_file(out) as written,
+        zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        for name, text in files.items():
+            archive.writestr(name, text)
+        if newest is not None:
+            path, ends_s = newest
+            part = Path(work) / f"{path.stem}.parquet"
+            export(path, part, begin_s=ends_s - seconds)
+            archive.write(part, part.name)
+        names = archive.namelist()
     print(f"wrote {out}: {', '.join(names)}", *missing, "Read it before you send it.", sep="\n")
     return 0
 

@@ -23,6 +23,7 @@ from thermoctl import __version__
 from thermoctl.fleet.batch import OnCase, run_all
 from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.recording.files import read_table
+from thermoctl.safe_file import whole_files, write_text
 from thermoctl.yamlfile import InputError
 
 
@@ -53,10 +54,10 @@ def prove(
         **summary(rows),
     }
     content = {**figures, "rows": plain(rows)}
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "proof.json").write_text(json.dumps(content, indent=1) + "\n")
-    (out / "summary.json").write_text(json.dumps(figures, indent=1) + "\n")
-    (out / "proof.html").write_text(page(content, rows))
+    with whole_files(out) as part:
+        write_text(part / "proof.json", json.dumps(content, indent=1) + "\n")
+        write_text(part / "summary.json", json.dumps(figures, indent=1) + "\n")
+        write_text(part / "proof.html", page(content, rows))
     return content
 
 

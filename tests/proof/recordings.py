@@ -13,6 +13,7 @@ from tests.proof.rigs import RIGS, Rig
 from tests.proof.score import CONFIDENT
 from thermoctl.fleet.batch import OnCase, run_all
 from thermoctl.fleet.jobs import Job, Run, outcome
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
@@ -66,7 +67,7 @@ def real(
     jobs = [_job(folder, r) for r in rigs]
     run_all(jobs, out / "cases", scheduler, workers, progress=progress)
     entries = [_entry(r, *outcome(j, out / "cases")) for r, j in zip(rigs, jobs, strict=True)]
-    (out / "real.json").write_text(json.dumps([asdict(e) for e in entries], indent=1) + "\n")
+    write_text(out / "real.json", json.dumps([asdict(e) for e in entries], indent=1) + "\n")
     return entries
 
 

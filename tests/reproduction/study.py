@@ -16,6 +16,7 @@ from tests.reproduction.report import report
 from tests.reproduction.rigs import CHAMBER, DISTURBANCES
 from tests.reproduction.seeds import Kept, SeedResult, one_seed
 from thermoctl.calibration.schedules import of_config
+from thermoctl.safe_file import write_text
 
 SEEN, FRESH = (*range(12), *range(1000, 1012)), tuple(range(2000, 2012))
 """Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, chain.PAPER_CHOICES,
@@ -66,11 +67,11 @@ def reproduce(
         "full": whole,
         "seconds": seconds,
     }
-    (out / "figures.json").write_text(json.dumps(content, indent=1, default=float), encoding="utf-8")
+    write_text(out / "figures.json", json.dumps(content, indent=1, default=float))
     page = report(runs.fresh, runs.disturbed, runs.kept, measured, before, reasons, whole, seconds)
-    (out / "report.html").write_text(page, encoding="utf-8")
+    write_text(out / "report.html", page)
     lines = [*_lines(measured, reasons, whole), f"     {seconds:.0f} s"]
-    (out / "figures.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(out / "figures.txt", "\n".join(lines) + "\n")
     for line in [*lines, str(out / "report.html")]:
         say(line)
     return all(g.met == "yes" for g in measured)

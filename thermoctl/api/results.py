@@ -21,6 +21,7 @@ from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run
 from thermoctl.report.page import figure
+from thermoctl.safe_file import whole_files, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -114,10 +115,9 @@ class Diagnosis:
 
     def save(self, folder: str | Path) -> None:
         """Write diagnosis.json and plant.yaml."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        save(self.plant.description, folder / "plant.yaml")
-        (folder / "diagnosis.json").write_text(json.dumps(self.json, indent=1, allow_nan=False) + "\n")
+        with whole_files(folder) as part:
+            save(self.plant.description, part / "plant.yaml")
+            write_text(part / "diagnosis.json", json.dumps(self.json, indent=1, allow_nan=False) + "\n")
 
     def plot(self, recording: int = 0) -> Figure:
         """Return one recording with the plant as it came, refitted, and with the findings."""

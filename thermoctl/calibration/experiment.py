@@ -19,6 +19,7 @@ from thermoctl.plant import load
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 ENDED = 3  # exit status of a test that ended early
@@ -110,7 +111,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
     if not ended:
         progress_path.unlink(missing_ok=True)
         return 0
-    progress_path.write_text(f"{done_s[0]:.3f}\n")
+    write_text(progress_path, f"{done_s[0]:.3f}\n")
     print(
         f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s, the amplifier is disabled: {ended}; "
         f"go on with --resume --out {path}",

@@ -200,8 +200,8 @@ def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: 
         "residual_rms_k": float(np.mean(thermal.info["residual_rms"])),
         "expansion_rms_um": _rms(residual),
     }
-    path.unlink(missing_ok=True)
-    modelfile.save_model(path, compensator, settings.rig.name, [recordings[n] for n in FITTED], figures)
+    recorded = [recordings[n] for n in FITTED]
+    modelfile.save_model(path, compensator, settings.rig.name, recorded, figures, replace=True)
     return Model(
         f"order {len(compensator.A_minus_I)} ({thermal.order} poles of the identified model, the rest for disturbing heat), "
         f"temperatures to {figures['residual_rms_k']:.3f} K rms, expansion to "

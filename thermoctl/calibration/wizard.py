@@ -40,6 +40,7 @@ from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
+from thermoctl.safe_file import make_folder, move, write_text
 from thermoctl.yamlfile import InputError
 
 TESTS = ("test_1", "test_2", "test_3", "test_4a", "test_4b")
@@ -111,13 +112,10 @@ class Wizard:
         return hashlib.sha256(files).hexdigest()
 
     def _save(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        temporary = self.state_path.with_suffix(".writing")
+        make_folder(self.folder)
         done = {k: asdict(v) for k, v in self.done.items()}
-        temporary.write_text(
-            json.dumps({"configuration": self.fingerprint, "done": done, "at_s": self.at_s}, indent=1)
-        )
-        temporary.replace(self.state_path)
+        state = {"configuration": self.fingerprint, "done": done, "at_s": self.at_s}
+        write_text(self.state_path, json.dumps(state, indent=1))
 
     def result(self, step: str, kind: type[_R]) -> _R:
         """Return the result of a step that is done."""
@@ -193,7 +191,7 @@ class Wizard:
                 "the same command goes on from here"
             )
             return False
-        part.replace(self._recording(name))
+        move(part, self._recording(name))
         self.at_s.pop(name, None)
         power = np.vstack(blocks)[:, AT["power_w"]]
         self.done[name] = steps.Test(
@@ -229,7 +227,8 @@ class Wizard:
 
     def _report(self) -> None:
         path = self.folder / "report.html"
-        path.write_text(
+        write_text(
+            path,
             report(
                 self.settings.rig.name,
                 self.rig.where,
@@ -239,7 +238,6 @@ class Wizard:
                 self.result("model", steps.Model),
                 self.result("proof", steps.Proof),
             ),
-            encoding="utf-8",
         )
         self.say(f"before and after: {path}")
 

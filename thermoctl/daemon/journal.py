@@ -1,13 +1,11 @@
-"""The daemon's log: lines on stderr, and the watcher that logs for the loop."""
+"""The watcher that logs for the loop."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import structlog
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.answers import readings
@@ -17,16 +15,6 @@ from thermoctl.rig.signals import AT, fault_words
 
 TELL_AGAIN_S = 10.0  # an intermittent fault is logged at most once in this time
 Log = Callable[..., None]
-
-
-def console_log(event: str, **values: Any) -> None:
-    """Write one line on stderr: event and key=value pairs; systemd's journal adds time and unit."""
-    structlog.wrap_logger(structlog.PrintLogger(sys.stderr), processors=[_line]).msg(event, **values)
-
-
-def _line(_logger: Any, _method: str, values: MutableMapping[str, Any]) -> str:
-    event = values.pop("event")
-    return " ".join([f"thermoctl: {event}", *(f"{k}={v}" for k, v in values.items() if v is not None)])
 
 
 class Watcher:
@@ -60,6 +48,7 @@ class Watcher:
                 self.log(
                     "state",
                     tick=int(rows[k, AT["tick"]]),
+                    t_s=round(float(rows[k, AT["t_s"]]), 3),
                     was=arming.STATES[int(before_state)],
                     now=arming.STATES[int(state)],
                 )
@@ -77,15 +66,16 @@ class Watcher:
                 continue
             self.told[name] = f["t_s"]
             if f["late_s"]:
-                self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=repr(LATE_REMEDY))
+                self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=LATE_REMEDY)
             self.log(
                 f["severity"],
                 tick=f["tick"],
+                t_s=round(f["t_s"], 3),
                 name=name,
                 follows=f["follows"] or None,
-                device=repr("; ".join(f["messages"])) if f["messages"] else None,
-                meaning=repr(f["meaning"]),
-                remedy=None if f["follows"] else repr(f["remedy"]),
+                device="; ".join(f["messages"]) or None,
+                meaning=f["meaning"],
+                remedy=None if f["follows"] else f["remedy"],
             )
 
     def _devices(self, row: np.ndarray) -> None:
@@ -102,9 +92,9 @@ class Watcher:
             self.changes[c] = said[0]
             if said[1] - self.told.get(role, -np.inf) >= TELL_AGAIN_S:
                 self.told[role] = said[1]
-                self.log("device", role=role, at_s=round(said[1], 3), message=repr(said[2]))
+                self.log("device", role=role, t_s=round(said[1], 3), message=said[2])
         code = readings.drive_code(self.shared, row)
         numbers = self.shared.areas["remark_numbers"][1:].tolist()
         if code is not None and numbers != self.code:
             self.code = numbers
-            self.log("device", role="amplifier_fault", message=repr(f"the drive reports {code['text']}"))
+            self.log("device", role="amplifier_fault", message=f"the drive reports {code['text']}")

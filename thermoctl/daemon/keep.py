@@ -10,9 +10,7 @@ is simulated without power.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import time
 import zlib
 from dataclasses import fields
@@ -23,6 +21,7 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
+from thermoctl.safe_file import write_text
 
 KEEP_S = 600.0  # older estimates are useless for the rig's slow parts
 EVERY_S = 5.0  # time between two savings by the supervisor
@@ -50,8 +49,11 @@ def _fingerprint(model: CompensatorModel) -> int:
     return crc
 
 
-def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
-    """Save a law's snapshot; return False when the disk refuses (the next start is then cold)."""
+def save(path: Path, model: CompensatorModel, state: np.ndarray) -> Path:
+    """Save a law's snapshot; return the file.
+
+    Raises WriteError when the disk refuses: the next start is cold.
+    """
     text = json.dumps(
         {
             "version": 1,
@@ -61,16 +63,8 @@ def save(path: Path, model: CompensatorModel, state: np.ndarray) -> bool:
             "state": encode(state),
         }
     )
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            path.with_suffix(".new").unlink()
-        fd = os.open(path.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(fd, "w") as file:
-            file.write(text)
-        path.with_suffix(".new").replace(path)
-        return True
-    except OSError:
-        return False
+    write_text(path, text, sync=False)  # after a power cut, another boot, it is not used
+    return path
 
 
 def load(path: Path, model: CompensatorModel) -> tuple[np.ndarray | None, float, str]:

@@ -16,11 +16,12 @@ from typing import Any
 from thermoctl.configuration.settings import Settings
 from thermoctl.daemon import keep
 from thermoctl.daemon.command_server import Commands, listen, serve
-from thermoctl.daemon.journal import Log, console_log
+from thermoctl.daemon.journal import Log
 from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.tick.shared import BEATS, RESUMED, WARNINGS, Shared
+from thermoctl.log import bind, console_log
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.rig.board import Board
@@ -149,9 +150,8 @@ def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
     loops.die_with_parent()
     path = Path(settings.socket.path)
     listener = listen(path, settings.socket.group)
-    log = partial(console_log, axis=settings.axis) if settings.axis else console_log
     try:
-        serve(listener, Commands(shared, settings, reload_settings, log), stop)
+        serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
     finally:
         listener.close()
         with contextlib.suppress(FileNotFoundError):
@@ -237,6 +237,7 @@ class Child:
 
 
 def _run_child(name: str, main: Callable[..., int], arguments: tuple[Any, ...]) -> None:
+    bind(axis=arguments[0].axis)
     try:
         code = main(*arguments)
     except InputError as e:

@@ -14,7 +14,6 @@ import base64
 import json
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,8 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.control import faults
 from thermoctl.control.model import ARRAYS, PLAIN, CompensatorModel, Parameters
 from thermoctl.daemon.misfit import Misfit
-from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, RUN_S, Shared
+from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, RESUMED, Shared
+from thermoctl.daemon.unsaved import Unsaved
 from thermoctl.rig.signals import AT
 
 INTERVAL_S = 0.1
@@ -206,21 +206,19 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
     from thermoctl.recording.writer import RecordingWriter
 
     config, rig = effective(settings), rig_identity(settings)
-    run = datetime.fromtimestamp(float(shared.counters[RUN_S]), UTC).strftime("%Y%m%dT%H%M%SZ")
+    tell = Unsaved(shared, "recording", log)
 
     def open_writer(law: str) -> RecordingWriter:
         """Return the writer of a new file; `law`: the text of `law_metadata`."""
         metadata = {
             "rig": rig,
-            "run": run,
+            "run": shared.run,
             "config": config,
             "law": law,
             "faults": json.dumps(faults.NAMES),
             POINTS: settings.channels.text(),
         }
-        return RecordingWriter(
-            settings.recording, metadata, rig, lambda text: log("recorder", what=text), settings.row.signals
-        )
+        return RecordingWriter(settings.recording, metadata, rig, tell, settings.row.signals)
 
     return Recorder(
         shared, compensator(settings), law_parameters(settings), settings.loop.period_s, open_writer, log

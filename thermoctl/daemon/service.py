@@ -19,6 +19,7 @@ from thermoctl.configuration.settings import Settings, load_rig
 from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.tick.loop import die_with_parent
+from thermoctl.safe_file import make_folder, write_text
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 
@@ -212,14 +213,11 @@ def install(config: Path, root: Path = Path("/")) -> int:
     files = {f"{UNITS}/{unit}": text} | {
         target: (SOURCE / name).read_text() for name, target in SHARED.items()
     }
-    try:
-        for target, content in files.items():
-            path = root / target
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(content)
-            print(f"wrote {path}")
-    except OSError as e:
-        raise InputError(f"{e.filename}: cannot be written: {e.strerror}; run it as root") from None
+    for target, content in files.items():
+        path = root / target
+        make_folder(path.parent, "run it as root")
+        write_text(path, content, "run it as root")
+        print(f"wrote {path}")
     if root == Path("/") and LIVE.is_dir():
         for command in (
             ["systemd-sysusers"],

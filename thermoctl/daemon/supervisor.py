@@ -28,7 +28,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
 from thermoctl.daemon.control_socket import ask
-from thermoctl.daemon.journal import Log, Watcher, console_log
+from thermoctl.daemon.journal import Log, Watcher
 from thermoctl.daemon.lock import hold
 from thermoctl.daemon.processes import (
     EXIT_FAILED,
@@ -40,8 +40,11 @@ from thermoctl.daemon.processes import (
     restart,
 )
 from thermoctl.daemon.tick import loop as loops
-from thermoctl.daemon.tick.assemble import check_mode, compensator, law_parameters, shared_name
+from thermoctl.daemon.tick.assemble import check_mode, compensator, law_parameters, rig_identity, shared_name
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
+from thermoctl.daemon.unsaved import Unsaved
+from thermoctl.log import bind, console_log
+from thermoctl.safe_file import WriteError
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import disable_amplifier
@@ -88,6 +91,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
 
     Raises InputError when it cannot be started.
     """
+    bind(rig=rig_identity(settings))
     if not COMPILED:
         log(
             "warning",
@@ -107,6 +111,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
     try:
         for part in settings.parts:
             shared.append(Shared.create(shared_name(part), part.channels))
+        bind(run=shared[0].run)
         board, loop, others = make_children(settings, shared)
         return _Supervision(settings, shared, loop, others, log).run()
     finally:
@@ -132,9 +137,9 @@ class _Supervision:
             signal.signal(number, lambda n, _: self.asked.append(n))
         signal.signal(signal.SIGHUP, lambda *_: self.reload_asked.append(1))
         self.notify = _Notify()
-        self.watchers = [
-            Watcher(s, partial(log, axis=part.axis) if part.axis else log) for part, s, _ in self.axes
-        ]
+        logs = [partial(log, axis=part.axis) if part.axis else log for part in settings.parts]
+        self.watchers = [Watcher(s, said) for s, said in zip(shared, logs, strict=True)]
+        self.unkept = [Unsaved(s, "estimates", said) for s, said in zip(shared, logs, strict=True)]
         self.started = self.kept_at = self.looked = time.monotonic()
         self.ready, self.ticks, self.stood_s = False, 0, 0.0
         self.stall_s = max(STALL_S, *(part.protection.late_s for part in settings.parts))
@@ -200,10 +205,14 @@ class _Supervision:
             watcher.look()
 
     def _keep(self) -> None:
-        for part, shared, model in self.axes:
+        for (part, shared, model), tell in zip(self.axes, self.unkept, strict=True):
             state = shared.state.get()
             if state is not None:
-                keep.save(keep.kept_path(part), model, state[2:])
+                try:
+                    keep.save(keep.kept_path(part), model, state[2:])
+                    tell("")
+                except WriteError as e:
+                    tell(e.why)
 
     def _end(self) -> None:
         """End all processes, the loop first; disable the amplifier where the loop did not end well."""

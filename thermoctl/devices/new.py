@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.buses import BUSES
@@ -26,11 +27,11 @@ def new(path: str, ask: Callable[[str], str] = input) -> int:
         text = _text(ask)
     except EOFError:
         raise InputError(f"{target}: not written, the answers ended early") from None
-    target.write_text(text, encoding="utf-8")
     try:
-        load_profile(target)
+        with whole_file(target) as part:
+            Path(part).write_text(text, encoding="utf-8")
+            load_profile(Path(part))
     except InputError as e:
-        target.unlink()
         raise InputError(f"{e}; nothing was written") from None
     print(f"{target}: written. Compare it with the device: thermoctl devices probe PORT --profile {target}")
     return EXIT_OK

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.plant.language import Plant
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 FILE = "memory.json"
@@ -119,7 +120,7 @@ def write(folder: Path, plant: Plant, memory: Memory) -> None:
             for h in memory.hypotheses
         ],
     }
-    (folder / FILE).write_text(json.dumps(found, allow_nan=False) + "\n")
+    write_text(folder / FILE, json.dumps(found, allow_nan=False) + "\n")
 
 
 def read(folder: Path, plant: Plant) -> Memory:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -33,6 +32,7 @@ from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.report.page import page
+from thermoctl.safe_file import whole_files, write_text
 from thermoctl.yamlfile import InputError
 
 STOPPED = (
@@ -97,20 +97,15 @@ def diagnose(
 
 def _write(folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any) -> None:
     """Write all files of a result, or none."""
-    with tempfile.TemporaryDirectory(dir=folder.parent) as part_name:
-        part = Path(part_name)
+    with whole_files(folder, remove=experiment_file.FILES) as part:
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
         save(found.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
         _report(found, result, part / "report.html")
-        (part / "diagnosis.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+        write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         memory.write(part, plant, _remembered(found))
-        written = experiment_file.write(part, found.case, *proposed) if proposed else []
-        folder.mkdir(parents=True, exist_ok=True)
-        for stale in experiment_file.FILES:
-            (folder / stale).unlink(missing_ok=True)
-        for name in ("plant.yaml", "report.html", "diagnosis.json", memory.FILE, *written):
-            shutil.move(part / name, folder / name)
+        if proposed:
+            experiment_file.write(part, found.case, *proposed)
 
 
 def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
@@ -122,7 +117,7 @@ def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
             raise
         result["notes"].append(f"report.html without figures and tables: {line}")
         summary = html.escape(f"{words(result)} {result['notes'][-1]}")
-        path.write_text(page("Diagnosis", [("", f"<p>{summary}</p>")]), encoding="utf-8")
+        write_text(path, page("Diagnosis", [("", f"<p>{summary}</p>")]))
 
 
 def _remembered(found: Diagnosis) -> memory.Memory:

@@ -19,6 +19,7 @@ from thermoctl.plant.equations import Equations
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.logger import parsed_columns
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c", "simulink-m": ".m"}
@@ -68,7 +69,4 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
         "c": lambda: c_source(plant, numbers),
         "simulink-m": lambda: matlab_source(plant, numbers, name),
     }[to]()
-    try:
-        out.write_text(text, encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
+    write_text(out, text)

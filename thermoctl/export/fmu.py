@@ -23,6 +23,7 @@ from thermoctl.plant.build import compiler
 from thermoctl.plant.equations import Equations
 from thermoctl.plant.language import Plant
 from thermoctl.plant.units import conversion, dimension
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 
 _PLATFORM = {"linux": ("linux64", ".so"), "darwin": ("darwin64", ".dylib")}
@@ -55,10 +56,8 @@ def write_fmu(plant: Plant, numbers: Values, path: Path, start: dict[str, float]
             fmu.writestr("modelDescription.xml", _description(plant, e, numbers, identifier, guid, begin))
             fmu.write(code, f"sources/{identifier}.c")
             fmu.write(library, f"binaries/{folder}/{identifier}{suffix}")
-        try:
-            shutil.copyfile(packed, path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        with whole_file(path) as part:
+            shutil.copyfile(packed, part)
 
 
 def _description(

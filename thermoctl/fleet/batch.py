@@ -18,6 +18,7 @@ from thermoctl import __version__
 from thermoctl.diagnose.run import diagnose_files
 from thermoctl.extras import load
 from thermoctl.fleet.jobs import Job, Run, done
+from thermoctl.safe_file import make_folder, write_text
 from thermoctl.yamlfile import InputError
 
 RETRIES = 3  # number of workers that may die on one case before it counts as failed
@@ -37,10 +38,7 @@ def run_one(job: Job, out: str) -> Run:
         error = f"{type(e).__name__}: {e}"
     run = _run(job, error, round(time.monotonic() - started, 2))
     run["cpu_s"] = round(time.process_time() - cpu, 2)
-    Path(out).mkdir(parents=True, exist_ok=True)
-    part = Path(out) / f".run-{os.getpid()}.json"
-    part.write_text(json.dumps(run) + "\n")
-    os.replace(part, Path(out) / "run.json")
+    write_text(make_folder(out) / "run.json", json.dumps(run) + "\n")
     return run
 
 
@@ -113,9 +111,7 @@ def run_all(
             job = futures[future]
             if future.status == "error":  # its workers died RETRIES times
                 run = _run(job, f"{type(future.exception()).__name__}: {future.exception()}", None)
-                folder = out / job.name
-                folder.mkdir(parents=True, exist_ok=True)
-                (folder / "run.json").write_text(json.dumps(run) + "\n")
+                write_text(make_folder(out / job.name) / "run.json", json.dumps(run) + "\n")
             else:
                 run = future.result()
             if progress:

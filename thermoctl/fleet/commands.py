@@ -24,6 +24,7 @@ from thermoctl.fleet.laws import comparisons, side_by_side
 from thermoctl.fleet.recordings import find_recordings, rig_of
 from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
+from thermoctl.safe_file import make_folder
 from thermoctl.yamlfile import InputError, suggest
 
 
@@ -207,7 +208,6 @@ def live_recordings(args: argparse.Namespace) -> list[str]:
         "that is diagnosed.",
         file=sys.stderr,
     )
-    Path(args.out).mkdir(parents=True, exist_ok=True)
-    path = Path(args.out) / "live.csv"
+    path = make_folder(args.out) / "live.csv"
     live.extract(load(args.plant), table, a, path)
     return [str(path)]

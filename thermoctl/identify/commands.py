@@ -39,7 +39,5 @@ def linearise(args: argparse.Namespace) -> int:
         write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
         print(args.gains)
     if args.out:
-        if args.replace:
-            Path(args.out).unlink(missing_ok=True)
-        print(save_model(args.out, model, args.rig, [args.plant]))
+        print(save_model(args.out, model, args.rig, [args.plant], replace=args.replace))
     return 0

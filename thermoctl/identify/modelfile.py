@@ -7,9 +7,7 @@ stay for a roll back. A file is refused when its checksum, its shape or its rig 
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from thermoctl import safe_file
 from thermoctl.control.model import UNITS, CompensatorModel
 from thermoctl.yamlfile import InputError, Node, load
 
@@ -55,12 +54,13 @@ def save_model(
     rig: str,
     recordings: Sequence[str | Path] = (),
     figures: dict[str, Any] | None = None,
+    replace: bool = False,
 ) -> Path:
     """Write a calibration; the file appears whole or not at all.
 
-    Raises InputError when it exists (a calibration is never overwritten) or the place cannot be written."""
+    Raises InputError when it exists (only `replace` overwrites a calibration) or cannot be written."""
     path = Path(path)
-    if path.exists():
+    if path.exists() and not replace:
         raise InputError(f"{path}: exists; calibrations are never overwritten, choose another name")
     numbers = {k: _plain(v) for k, v in asdict(model).items()}
     content: dict[str, Any] = {
@@ -73,15 +73,12 @@ def save_model(
         "model": numbers,
     }
     content["checksum"] = _checksum(content)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _write(
-            path,
-            "# Written by thermoctl; edit nothing here, make another calibration instead.\n"
-            + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120),
-        )
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    safe_file.make_folder(path.parent)
+    safe_file.write_text(
+        path,
+        "# Written by thermoctl; edit nothing here, make another calibration instead.\n"
+        + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120),
+    )
     return path
 
 
@@ -148,7 +145,7 @@ def install(
     path = save_model(
         folder / f"{number:04d}-{datetime.now(UTC):%Y%m%dT%H%M%S}.yaml", model, rig, recordings, figures
     )
-    _write(folder / "current", path.name + "\n")
+    safe_file.write_text(folder / "current", path.name + "\n")
     return path
 
 
@@ -189,17 +186,8 @@ def roll_back(folder: str | Path, name: str | None = None) -> Path:
                 f"{folder}: no calibration '{name}'; there are {', '.join(p.name for p in files) or 'none'}"
             )
     load_calibration(path)
-    _write(Path(folder) / "current", path.name + "\n")
+    safe_file.write_text(Path(folder) / "current", path.name + "\n")
     return path
-
-
-def _write(path: Path, text: str) -> None:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
-    with os.fdopen(handle, "w", encoding="utf-8") as f:
-        f.write(text)
-        f.flush()
-        os.fsync(f.fileno())
-    os.replace(name, path)
 
 
 def _plain(v: Any) -> Any:

@@ -22,7 +22,6 @@ moving average.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +30,7 @@ from pathlib import Path
 import numpy as np
 from scipy import optimize, signal
 
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 UNCERTAIN_DEG = 5.0  # no gains are proposed when the phase near the crossover has a larger standard error
@@ -294,9 +294,7 @@ def write_values(config: Path, section: str, values: dict[str, str], axis: str =
             raise InputError(
                 f"{config}: {section}.{name} does not stand on a line of its own; write by hand: {by_hand}"
             )
-    temporary = config.with_name(f".{config.name}.writing")
-    temporary.write_text(text[:begin] + body + text[end:], encoding="utf-8")
-    os.replace(temporary, config)
+    write_text(config, text[:begin] + body + text[end:])
 
 
 def _body(text: str, place: Sequence[str]) -> tuple[int, int, str] | None:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
+from thermoctl.safe_file import move
 from thermoctl.yamlfile import InputError
 
 
@@ -82,7 +83,7 @@ def library(source: str, folders: Sequence[Path] = (), key: str = "") -> ctypes.
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             with tempfile.TemporaryDirectory(dir=folder) as work:
                 _build(Path(work), source, folders)
-                os.replace(Path(work) / "plant.so", path)
+                move(Path(work) / "plant.so", path)
         except OSError:  # a read-only home: build for this process only
             with tempfile.TemporaryDirectory() as work:
                 _build(Path(work), source, folders)

@@ -23,6 +23,7 @@ from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile
 from thermoctl.recording.files import write_table
 from thermoctl.recording.logger import parsed_columns
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 
 RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at the start of a block
@@ -212,10 +213,11 @@ def _plot(
     panels[0].legend(loc="upper right", fontsize=8)
     panels[0].set_title(f"{model.plant.title}: {table.name}", fontsize=10)
     panels[-1].set_xlabel("t [s]")
-    try:
-        figure.savefig(name, dpi=120)
-    except (OSError, ValueError) as e:
-        raise InputError(f"{name}: cannot be written: {e}") from None
+    with whole_file(name) as part:
+        try:
+            figure.savefig(part, dpi=120, format=name.suffix[1:] or None)
+        except ValueError as e:  # no such format
+            raise InputError(f"{name}: cannot be written: {e}") from None
 
 
 def refit(args: argparse.Namespace) -> int:

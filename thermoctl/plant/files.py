@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from thermoctl.plant.foreign import plant_node
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parse import parse
 from thermoctl.plant.units import check_units
+from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
 
@@ -53,12 +53,9 @@ def extended(plant: Plant, change: Callable[[dict[str, Any]], None], file: str |
 
 def save(plant: Plant, path: str | Path, note: str = "") -> None:
     """Write the plant file, whole or not at all; `note` becomes a comment at its head."""
-    path = Path(path)
     text = "".join(f"# {line}\n" for line in note.splitlines())
     text += yamlfile.dumps(plant.plain())
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, text)
 
 
 def _checked(root: yamlfile.Node) -> Plant:

@@ -24,6 +24,7 @@ from thermoctl.plant.files import loads
 from thermoctl.plant.units import conversion, dimension
 from thermoctl.recording.logger import parsed_columns, read_recording
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import write_text
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, suggest
 
@@ -51,10 +52,7 @@ def new(args: argparse.Namespace) -> int:
             print(f"note: {table.path}: {note}", file=sys.stderr)
         text = draft(table, _names(args.inputs), _names(args.outputs))
     plant = loads(text, str(path))
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    write_text(path, text)
     todo = [
         f"  {path}:{n}: {line.split('# ')[1]}"
         for n, line in enumerate(text.splitlines(), 1)

@@ -18,6 +18,7 @@ from rich.table import Table
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
@@ -132,10 +133,8 @@ def draw(plant: Plant, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in (".svg", ".png", ".pdf"):
         raise InputError(f"{path}: a name that ends in .svg, .png or .pdf was expected")
-    try:
-        drawing(plant).savefig(path, dpi=130)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    with whole_file(path) as part:
+        drawing(plant).savefig(part, dpi=130, format=path.suffix[1:].lower())
 
 
 def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:

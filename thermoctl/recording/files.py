@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +21,7 @@ import pyarrow.parquet
 from thermoctl.recording import formats
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError, suggest
 
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
@@ -80,22 +79,19 @@ def write_table(path: str | Path, table: Table) -> None:
     if kind not in (".csv", ".parquet", ".arrow"):
         raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
     arrow = to_arrow(table)
-    try:
-        with whole_file(path) as temporary:
-            if kind == ".csv":
-                pa.csv.write_csv(arrow, temporary, pa.csv.WriteOptions(quoting_style="needed"))
-            elif kind == ".parquet":
-                pa.parquet.write_table(arrow, temporary, compression="zstd")
-            else:
-                with (
-                    pa.OSFile(temporary, "wb") as f,
-                    pa.ipc.new_file(
-                        f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
-                    ) as writer,
-                ):
-                    writer.write_table(arrow)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+    with whole_file(path) as temporary:
+        if kind == ".csv":
+            pa.csv.write_csv(arrow, temporary, pa.csv.WriteOptions(quoting_style="needed"))
+        elif kind == ".parquet":
+            pa.parquet.write_table(arrow, temporary, compression="zstd")
+        else:
+            with (
+                pa.OSFile(temporary, "wb") as f,
+                pa.ipc.new_file(
+                    f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
+                ) as writer,
+            ):
+                writer.write_table(arrow)
 
 
 def to_arrow(table: Table) -> pa.Table:
@@ -108,27 +104,6 @@ def to_arrow(table: Table) -> pa.Table:
         f.with_metadata({"unit": table.units[f.name]}) if f.name in table.units else f for f in arrow.schema
     ]
     return arrow.cast(pa.schema(fields, table.meta or None))
-
-
-class whole_file:  # noqa: N801 used as a function
-    """Write to a temporary file; rename it to `path` when the block ends without error, else delete it."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __enter__(self) -> str:
-        fd, self.temporary = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.fchmod(fd, 0o666 & ~umask)
-        os.close(fd)
-        return self.temporary
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            os.replace(self.temporary, self.path)
-        else:
-            os.unlink(self.temporary)
 
 
 def checked(path: Path, raw: Raw) -> Table:

@@ -16,9 +16,10 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from thermoctl.recording import formats
-from thermoctl.recording.files import read_table, to_arrow, whole_file
+from thermoctl.recording.files import read_table, to_arrow
 from thermoctl.recording.stream import END, open_stream
 from thermoctl.rig.signals import of_recording
+from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError, suggest
 
 
@@ -108,17 +109,15 @@ def recover(path: str | Path, out: str | Path) -> Info:
         pass
     if out.exists():
         raise InputError(f"{out}: exists already; name another file")
-    try:
-        with whole_file(out) as temporary, open(path, "rb") as source, open(temporary, "wb") as target:
+    with whole_file(out) as temporary:
+        with open(path, "rb") as source, open(temporary, "wb") as target:
             left = stream.good_bytes
             while left:
                 piece = source.read(min(left, 1 << 22))
                 target.write(piece)
                 left -= len(piece)
             target.write(END)
-    except OSError as e:
-        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
-    shutil.copystat(path, out)
+        shutil.copystat(path, temporary)
     return info(out)
 
 
@@ -140,13 +139,10 @@ def export(
     if begin_s >= end_s:
         raise InputError(f"{out}: --from {begin_s:g} s is not before --to {end_s:g} s")
     want = None if columns is None else list(columns)
-    try:
-        with whole_file(out) as temporary:
-            if kind in (".mf4", ".mcap") or path.suffix != ".arrows":
-                return _export_table(path, temporary, kind, want, begin_s, end_s)
-            return _export_stream(path, temporary, kind, want, begin_s, end_s)
-    except OSError as e:
-        raise InputError(f"{out}: cannot be written: {e.strerror or e}") from None
+    with whole_file(out) as temporary:
+        if kind in (".mf4", ".mcap") or path.suffix != ".arrows":
+            return _export_table(path, temporary, kind, want, begin_s, end_s)
+        return _export_stream(path, temporary, kind, want, begin_s, end_s)
 
 
 def _export_table(
@@ -162,9 +158,9 @@ def _export_table(
     if kind == ".mcap":
         formats.write_mcap(out, table)
     elif kind == ".mf4":
-        with TemporaryDirectory(dir=Path(out).parent) as folder:  # asammdf requires its own suffix
+        with TemporaryDirectory() as folder:  # asammdf requires its own suffix
             formats.write_mdf(f"{folder}/export.mf4", table)
-            Path(folder, "export.mf4").replace(out)
+            shutil.copyfile(f"{folder}/export.mf4", out)
     elif kind == ".csv":
         pa.csv.write_csv(to_arrow(table), out)
     else:

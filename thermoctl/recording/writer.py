@@ -3,18 +3,20 @@
 Each is an Arrow IPC stream with zstd. Every half second a batch is written and synced. A power cut loses the
 ticks after the last batch; the file before it can be read (stream.py). Files are named after the rig and
 their start, `rig-20261121T043000.123Z.arrows` and `.10hz.arrows`. The oldest are deleted when the disk budget
-is full.
+is used up, and only after the beginning of the new file is on the disk.
 
-A failing disk raises nothing here. Lost rows are counted and logged once, and the next file is tried some
-seconds later. The daemon continues.
+A failing or full disk raises nothing here and deletes nothing. Lost rows are counted, the reason is reported
+once, and the next file is tried some seconds later. The daemon continues.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -26,6 +28,7 @@ import pyarrow as pa
 
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.rig.signals import SIGNALS, Signal
+from thermoctl.safe_file import part_file, reason, sync_folder
 
 BATCH_S = 0.5  # of ticks in one batch of the full rate; a power loss costs at most this
 BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster
@@ -49,22 +52,23 @@ class StreamFile:
     """One Arrow stream on disk; a batch is written and synced whole, or absent. Raises OSError."""
 
     def __init__(self, path: Path, columns: pa.Schema):
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         self.path, self.schema = path, columns
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self.bytes = 0
+        self.bytes = self.rows = 0
         self._buffer = io.BytesIO()
+        self._fd, part = part_file(path)
         try:
             self._stream = pa.ipc.new_stream(self._buffer, columns, options=_COMPRESSED)
             self._stream.write_table(columns.empty_table())  # writes the schema message
             self._put()
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            os.replace(part, path)
+            sync_folder(path.parent)
         except OSError:
             os.close(self._fd)
-            path.unlink(missing_ok=True)
+            for name in (part, path):
+                with contextlib.suppress(OSError):
+                    os.unlink(name)
             raise
 
     def write(self, rows: np.ndarray) -> None:
@@ -74,6 +78,7 @@ class StreamFile:
         )
         self._stream.write_batch(batch, custom_metadata={CRC: checksums(batch)})
         self._put()
+        self.rows += len(rows)
 
     def _put(self) -> None:
         data = self._buffer.getvalue()
@@ -89,9 +94,12 @@ class StreamFile:
         self.bytes += len(data)
 
     def close(self) -> None:
-        """Write the end mark and release the file."""
+        """Write the end mark and release the file; one without rows is removed."""
         try:
-            _write_all(self._fd, END)
+            if self.rows:
+                _write_all(self._fd, END)
+            else:
+                os.unlink(self.path)
         finally:
             os.close(self._fd)
 
@@ -187,8 +195,8 @@ class RecordingWriter:
 
     - settings: folder, sizes and budgets
     - metadata: configuration, model and law, written into the files
-    - log(text): called once when the disk fails, and when it works again
-    - `error`: the last message of the disk, '' when it works"""
+    - log(text): called with the reason when the disk fails, and with '' once rows are on the disk
+    - `error`: the reason why nothing is recorded, '' when it is"""
 
     def __init__(
         self,
@@ -210,7 +218,7 @@ class RecordingWriter:
         self._tier_rows: list[np.ndarray] = []
         self._time = [s.name for s in signals].index("t_s")
         self._begun = self._failed = clock()
-        self._pruned_at = 0
+        self._pruned_at, self._working = 0, False
         self._full_file: StreamFile | None = None
         self._tier_file: StreamFile | None = None
         self._files_of = (
@@ -256,46 +264,51 @@ class RecordingWriter:
             self.lost += len(rows)
             return
         try:
-            try:
-                self._full_file.write(rows)
-            except OSError as e:
-                if e.errno not in (errno.ENOSPC, errno.EDQUOT) or not prune(
-                    self.directory, FULL, 0, self.path, 1
-                ):
-                    raise
-                self._full_file.write(rows)  # the oldest file was deleted
+            self._full_file.write(rows)
+            os.stat(self._full_file.path)  # raises where the file was deleted or its disk is gone
+        except OSError as e:
+            self.lost += len(rows)
+            self._fail(e)
+            return
+        try:
             self._tier_rows.append(self._tier.add(rows))
             self._flush_tier(TIER_BATCH_ROWS)
             if self._full_file.bytes - self._pruned_at > self.budget / 64:
                 self._prune()
         except OSError as e:
-            self.lost += len(rows)
             self._fail(e)
+            return
+        if not self._working:
+            self._working = True
+            self.log("")
 
     def close(self) -> int:
         """Flush, write the end marks, release the files; returns the rows lost since the last `write`."""
         self.flush()
         try:
-            if self._full_file:
-                self._tier_rows.append(self._tier.add(np.empty((0, len(self._full_file.schema))), last=True))
-                self._flush_tier(1)
+            self._end_tier()
         except OSError as e:
             self._fail(e)
         self._release()
         new, self._told = self.lost - self._told, self.lost
         return new
 
+    def _end_tier(self) -> None:
+        """Write the rows of the tier that wait."""
+        if self._full_file:
+            self._tier_rows.append(self._tier.add(np.empty((0, len(self._full_file.schema))), last=True))
+            self._flush_tier(1)
+
     def _flush_tier(self, least: int) -> None:
         if self._tier_file and sum(map(len, self._tier_rows)) >= least:
-            rows, self._tier_rows = np.concatenate(self._tier_rows), []
-            self._tier_file.write(rows)
+            self._tier_file.write(np.concatenate(self._tier_rows))
+            self._tier_rows = []
 
     def _open(self) -> None:
         rig, full, tier, wall = self._files_of
         stamp = datetime.fromtimestamp(wall(), UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._prune()
             for again in ("", *(f"-{i}" for i in range(1, 1000))):
                 stem = self.directory / f"{rig}-{stamp}{again}"
                 try:
@@ -304,6 +317,7 @@ class RecordingWriter:
                 except FileExistsError:
                     continue
             self._tier_file = StreamFile(stem.with_name(stem.name + TIER), tier)
+            self._prune()
         except OSError as e:
             self._fail(e)
 
@@ -316,21 +330,39 @@ class RecordingWriter:
         )
 
     def _fail(self, e: OSError) -> None:
-        self.error = (
-            f"{self.directory}: nothing is recorded: {e.strerror or e}; trying again every {RETRY_S:g} s"
-        )
+        self.error = f"{self.directory}: {reason(e)}"
         self._failed = self.clock()
         self.log(self.error)
+        with contextlib.suppress(OSError):  # often the few bytes of the tier still fit
+            self._end_tier()
         self._release()
 
     def _release(self) -> None:
         for f in (self._full_file, self._tier_file):
             if f is not None:
-                try:
+                with contextlib.suppress(OSError):  # the file is readable without its end mark
                     f.close()
-                except OSError as e:  # the file is readable without its end mark
-                    self.log(f"{f.path}: left without an end mark: {e.strerror or e}")
         self._full_file = self._tier_file = None
+
+
+def disk_warning(settings: Limits) -> str:
+    """Return a sentence where the budgets are larger than the disk has room for; '' else."""
+    folder = Path(settings.directory).absolute()
+    place = next(p for p in (folder, *folder.parents) if p.exists())
+    try:
+        room = shutil.disk_usage(place).free
+        if folder.is_dir():
+            for kind in (FULL, TIER):
+                room += sum(p.stat().st_size for p in recording_files(folder, kind))
+    except OSError:  # the recorder reports it
+        return ""
+    wanted = (settings.budget_gb + settings.tier_budget_gb) * 1e9
+    if wanted <= room:
+        return ""
+    return (
+        f"recording.budget_gb and tier_budget_gb are {wanted / 1e9:.3g} GB together, but the disk of {folder} has room for "
+        f"{room / 1e9:.3g} GB: it fills before an old recording is deleted, and then nothing is recorded; lower them"
+    )
 
 
 def recording_files(directory: Path, kind: str) -> list[Path]:

@@ -102,7 +102,8 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
 def message_lines(status: Mapping[str, Any]) -> list[str]:
     """List a line for each invalid reading, with its device's message.
 
-    In FAULT also readings that are valid again are listed. The drive's newest error code comes last.
+    In FAULT also readings that are valid again are listed. Then comes what cannot be saved, and the drive's
+    newest error code.
     """
     lines = []
     for role, r in status["readings"].items():
@@ -111,10 +112,19 @@ def message_lines(status: Mapping[str, Any]) -> list[str]:
             lines.append(f"{role} {r['state'].lower()}, {span(r['age_s'])} old{said}")
         elif said and status["state"] == "FAULT":
             lines.append(f"{role} is well again; before{said}")
+    lines += unsaved_lines(status)
     if code := status["drive_code"]:
         reset = "" if code["stands"] else ", reset since"
         lines.append(f"the drive's error code {code['text']} at {clock(code['wall_s'])}{reset}")
     return lines
+
+
+def unsaved_lines(status: Mapping[str, Any]) -> list[str]:
+    """List a line for each kind of data that cannot be saved at present, with the reason."""
+    return [
+        f"not saved: {u['what']}, since {clock(u['since_s'])}: {u['why']}; tried again by itself"
+        for u in status.get("unsaved", ())
+    ]
 
 
 def counter_lines(status: Mapping[str, Any]) -> list[str]:

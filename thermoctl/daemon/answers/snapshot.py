@@ -10,6 +10,7 @@ import numpy as np
 from thermoctl.control import arming
 from thermoctl.daemon.answers import readings
 from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
+from thermoctl.daemon.unsaved import unsaved
 from thermoctl.rig.channels import STATUS_NAMES
 from thermoctl.rig.signals import AT, Row
 
@@ -86,6 +87,7 @@ def status(shared: Shared) -> dict[str, Any]:
             "rows": int(shared.counters[RECORDER_ROWS]),
             "lost": int(shared.counters[RECORDER_LOST]),
         },
+        "unsaved": unsaved(shared),
         "wall_s": number["wall_s"],
         "faults": readings.standing_faults(shared, row, found),
     }

@@ -26,6 +26,7 @@ from thermoctl.daemon.tick.assemble import (
     priority_warning,
 )
 from thermoctl.daemon.tick.loop import become_real_time
+from thermoctl.recording.writer import disk_warning
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
 from thermoctl_hal.rig.make import device_notes, fast_devices, make_backend, make_backends
@@ -48,6 +49,8 @@ def check(settings: Settings) -> int:
         f"{settings.path}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
         f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
     )
+    if note := disk_warning(settings.recording):
+        print(f"note: {note}")
     if settings.hal.backend == "devices":
         for note in [*device_notes(settings), *without]:
             print(f"note: {note}")

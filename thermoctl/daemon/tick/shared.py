@@ -12,6 +12,7 @@ daemon at any later time.
     state       the law's state at intervals, with tick and generation: where a recording's replay starts
     lateness, busy, reference   histograms, microseconds
     device_counters   frames, errors, reconnections of each device
+    unsaved     data that cannot be saved now, and why (daemon/unsaved.py)
     counters    start time, ticks of the reference loop, process ids
 """
 
@@ -22,6 +23,7 @@ import mmap
 import os
 import time
 import zlib
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +42,9 @@ BINS = 4096  # us
 STATE_NUMBERS = 4096
 TEXT_WORDS = 40  # of 8 bytes each, for a device's message
 COUNTER_WORDS = 512  # of 8 bytes each, for the counters of all devices as text
+UNSAVED = ("recording", "estimates")
+"""The writers of the daemon: the places of `Shared.unsaved`."""
+UNSAVED_WORDS = 128  # of 8 bytes each, for the reason
 SHARED_MEMORY = Path("/dev/shm")
 
 DECLARATION_BYTES = 16384
@@ -74,6 +79,8 @@ def _areas(row: Row) -> tuple[tuple[str, str, tuple[int, ...]], ...]:
         ("texts", "u8", (channels, TEXT_WORDS)),
         ("device_counters_sequence", "u8", (1,)),
         ("device_counters", "f8", (COUNTER_WORDS,)),
+        ("unsaved_sequences", "u8", (len(UNSAVED), 1)),
+        ("unsaved", "f8", (len(UNSAVED), UNSAVED_WORDS)),
     )
 
 
@@ -116,6 +123,9 @@ class Shared:
         self.busy = Histogram(a["busy"], a["largest"][1:2])
         self.reference = Histogram(a["reference"], a["largest"][2:3])
         self.device_counters = Box(a["device_counters_sequence"], a["device_counters"])
+        self.unsaved = {
+            name: Box(a["unsaved_sequences"][k], a["unsaved"][k]) for k, name in enumerate(UNSAVED)
+        }
         self.counters = a["counters"]
         self.remarks = self.make_remarks()
 
@@ -151,8 +161,13 @@ class Shared:
                 f"shared memory '{name}': left by another user; remove {path}, or take another socket.path"
             ) from None
         try:
-            os.ftruncate(file, size)
+            os.posix_fallocate(file, 0, size)  # where memory is lacking: an error now, no SIGBUS in the loop
             shared = cls(mmap.mmap(file, size), path, channels)
+        except OSError as e:
+            path.unlink(missing_ok=True)
+            raise InputError(
+                f"shared memory '{name}': {size} bytes are not to be had on {SHARED_MEMORY}: {e.strerror}; free some there"
+            ) from None
         finally:
             os.close(file)
         shared.areas["declaration"].view("u1")[: len(text)] = np.frombuffer(text, "u1")
@@ -192,6 +207,12 @@ class Shared:
     def beats(self, place: int) -> float:
         """Return the rounds that the helper at this place has done."""
         return float(self.counters[BEATS + place])
+
+    @property
+    def run(self) -> str:
+        """The run's name: the daemon's start in UTC, as recordings and log lines have it."""
+        start = datetime.fromtimestamp(float(self.counters[RUN_S]), UTC)
+        return start.strftime("%Y%m%dT%H%M%SZ")
 
     def remove(self) -> None:
         """Remove the segment's name (by its creator); the memory is freed with its last user."""

@@ -47,6 +47,7 @@ from thermoctl.daemon.tick.assemble import rig_identity
 from thermoctl.daemon.views.access import MIN_TOKEN, Policy, Refused, parse_address
 from thermoctl.daemon.views.metrics import CONTENT_TYPE, metrics
 from thermoctl.daemon.views.watch import Watch
+from thermoctl.log import console_log
 from thermoctl.recording.history import history
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.signals import AT
@@ -352,10 +353,13 @@ class Handler(BaseHTTPRequestHandler):
         if command not in COMMANDS:
             raise Refused(HTTPStatus.BAD_REQUEST, f"the commands are {', '.join(COMMANDS)}")
         answer = ask(self.server.settings.socket.path, {"command": command, "value": value})
-        print(
-            f"command {command} {'' if value is None else value} from {self.client_address[0]}: "
-            f"{'done' if answer['ok'] else answer['error']}",
-            flush=True,
+        console_log(
+            "command",
+            name=command,
+            value=value,
+            peer=self.client_address[0],
+            ok=answer["ok"],
+            error=answer.get("error"),
         )
         self._json(answer, HTTPStatus.OK if answer["ok"] else HTTPStatus.CONFLICT)
 

@@ -32,6 +32,7 @@ from thermoctl.daemon.service import START_S, STOP_S, Background
 from thermoctl.daemon.views.dashboard import make_server, url
 from thermoctl.daemon.views.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.views.watch import Watch
+from thermoctl.safe_file import make_folder, write_text
 from thermoctl.shipped import state_folder
 from thermoctl.yamlfile import InputError
 
@@ -77,7 +78,7 @@ def _own(settings: Settings) -> Any:
     Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it.
     """
     folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     hal = settings.hal
     own = dataclasses.replace(
         settings,
@@ -94,7 +95,7 @@ def _own(settings: Settings) -> Any:
         raise InputError(f"{folder}: another demo runs here (pid {pid}); stop it first")
     (folder / "rig.state").unlink(missing_ok=True)  # no saved estimates: the simulated rig starts cold
     path = folder / "rig.yaml"
-    path.write_text(f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
+    write_text(path, f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
     return load_settings(path)
 
 

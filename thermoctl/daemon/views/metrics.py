@@ -15,7 +15,8 @@ import numpy as np
 
 from thermoctl.control import arming, faults
 from thermoctl.daemon.answers.readings import readings, valid_signals
-from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, Shared
+from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, UNSAVED, Shared
+from thermoctl.daemon.unsaved import unsaved
 from thermoctl.rig.signals import AT, Row, fault_word
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -122,9 +123,12 @@ def _signal_families(row: np.ndarray, layout: Row) -> Iterator[Family]:
 def _recorder_families(shared: Shared) -> Iterator[Family]:
     for name, help, place in (
         ("rows", "ticks written to the recording", RECORDER_ROWS),
-        ("lost", "ticks that the recorder lost because it fell behind", RECORDER_LOST),
+        ("lost", "ticks that the recorder lost: it fell behind, or could not write", RECORDER_LOST),
     ):
         yield f"thermoctl_recorder_{name}_total", "counter", help, [("", shared.counters[place])]
+    now = {u["what"] for u in unsaved(shared)}
+    help = "1 while the disk cannot be written: `thermoctl status` says why"
+    yield "thermoctl_unsaved", "gauge", help, [(f'{{what="{n}"}}', float(n in now)) for n in UNSAVED]
 
 
 def _histogram(name: str, help: str, counts: np.ndarray) -> list[str]:

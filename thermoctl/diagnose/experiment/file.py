@@ -15,6 +15,7 @@ from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.experiment.design import TOGETHER, Excitation
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
+from thermoctl.safe_file import write_text
 
 FORMAT = "thermoctl-experiments/1"
 FILES = ("next_experiment.yaml", "next_experiment.csv")
@@ -58,7 +59,7 @@ def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation
         )
         for p in entry["predicted"].values():
             lines.append(f"      {json.dumps(p['column'])}: [{p['low']:.6g}, {p['high']:.6g}]")
-    (folder / FILES[0]).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(folder / FILES[0], "\n".join(lines) + "\n")
     t = np.arange(0.0, chosen.duration_s + 1e-9, max(entry["sample_s"], chosen.duration_s / ROWS))
     columns = {n: np.interp(t, c[:, 0], c[:, 1]) for n, (_, c) in driven.items()}
     write_table(folder / FILES[1], Table("next_experiment", FILES[1], t, columns))

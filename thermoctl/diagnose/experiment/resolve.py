@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnose.experiment.file import FILES
+from thermoctl.safe_file import write_text
 
 ROUNDS = 3
 
@@ -45,7 +46,5 @@ def resolve(
         paths.append(str(recording))
         result = diagnosed(paths)
     result["resolved"] = history
-    (out / "diagnosis.json").write_text(
-        json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    write_text(out / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
     return result

@@ -19,6 +19,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
 from thermoctl.report.page import figure, table, unit
+from thermoctl.safe_file import make_folder, write_text
 from thermoctl.yamlfile import InputError
 
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
@@ -255,9 +256,10 @@ def save_effect(found: Mapping[str, Any], label: str, folder: Path) -> Path:
         )
     if not label.isidentifier():
         raise InputError(f"'{label}': a name of letters, digits and _ was expected, such as windage")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / f"{label}.yaml"
     if path.exists():
         raise InputError(f"{path}: exists already; another name or folder (--effects) was expected")
-    path.write_text(yaml.safe_dump({**law["effect"], "effect": label}, sort_keys=False, allow_unicode=True))
+    effect = {**law["effect"], "effect": label}
+    write_text(path, yaml.safe_dump(effect, sort_keys=False, allow_unicode=True))
     return path

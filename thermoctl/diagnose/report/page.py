@@ -19,6 +19,7 @@ from thermoctl.plant.estimate import Estimate, report
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, page, table, unit
+from thermoctl.safe_file import write_text
 
 POINTS = 1500  # of a curve; more would only make the page heavy
 SHOWN = 6  # outputs that are drawn, worst first
@@ -47,7 +48,7 @@ def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) 
     ]
     case = found.case
     note = f"{case.plant.title} · {', '.join(t.name for t in case.tables)}"
-    Path(path).write_text(page("Diagnosis", [(h, b) for h, b in sections if b], note), encoding="utf-8")
+    write_text(path, page("Diagnosis", [(h, b) for h, b in sections if b], note))
 
 
 def _lead(result: Mapping[str, Any]) -> str:

@@ -1,0 +1,89 @@
+"""The project's log: structlog events on stderr, each with time, rig, axis and run.
+
+A terminal and a log file get readable lines, journald gets JSON. Nothing stops when a line cannot be
+written: lost lines are counted, and the next one that can be written says how many.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import MutableMapping
+from typing import Any
+
+import structlog
+
+_bound: dict[str, Any] = {}
+_LAST = ("rig", "axis", "run")  # fields at a line's end
+
+
+def bind(**fields: Any) -> None:
+    """Add fields to all further events of this process and of those that it forks.
+
+    Empty ones are left out.
+    """
+    _bound.update({name: value for name, value in fields.items() if value})
+
+
+def console_log(event: str, **fields: Any) -> None:
+    """Log an event; fields that are None are left out."""
+    _logger.info(event, **fields)
+
+
+def _add_bound(_: Any, __: str, fields: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    found = {name: value for name, value in fields.items() if value is not None}
+    last = {**_bound, **found}
+    return {k: v for k, v in found.items() if k not in _LAST} | {k: last[k] for k in _LAST if k in last}
+
+
+def _to_journal() -> bool:
+    """Return whether systemd connected stderr with journald (JOURNAL_STREAM of systemd.exec(5))."""
+    try:
+        found = os.fstat(2)
+    except OSError:
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
+def _render(_: Any, __: str, fields: MutableMapping[str, Any]) -> str:
+    at, event = fields.pop("time"), fields.pop("event")
+    if _to_journal():
+        return json.dumps({"time": at, "event": event, **fields}, default=str)
+    return " ".join([f"{at} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in fields.items())])
+
+
+def _text(value: Any) -> str:
+    text = str(value)
+    return repr(text) if not text or any(c in text for c in " \n\"'=") else text
+
+
+class _Stderr:
+    """Writes whole lines on stderr; never raises for a full disk or a closed pipe."""
+
+    lost = 0
+    torn = False
+
+    def info(self, line: str) -> None:
+        """Write one line."""
+        head = "\n" if self.torn else ""
+        if self.lost:
+            at = line.split(" ", 1)[0] + " " if not line.startswith("{") else ""
+            head += f"{at}thermoctl: the log could not be written, {self.lost} lines are lost\n"
+        data = f"{head}{line}\n".encode(errors="backslashreplace")
+        try:
+            if sys.stderr is sys.__stderr__:
+                done = os.write(2, data)
+                self.torn = done < len(data)
+            else:  # replaced, in a test or a notebook
+                sys.stderr.write(data.decode())
+            self.lost = 0
+        except (OSError, ValueError, AttributeError):
+            self.lost += 1
+
+
+_logger = structlog.wrap_logger(
+    _Stderr(),
+    processors=[_add_bound, structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"), _render],
+    wrapper_class=structlog.BoundLogger,
+)
