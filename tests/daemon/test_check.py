@@ -29,9 +29,10 @@ def change(config, *pairs):
     "pairs,lacks",
     [
         ([], ""),
-        ([("voltage: voltage_v, ", "")], ""),  # R I^2
-        ([("voltage: voltage_v, ", ""), ("resistance_ohm: 5.0", "resistance_ohm: 0")], "without voltage_v"),
-        ([(", current: current_a", "")], "without current_a:"),
+        ([("voltage: voltage_v, ", ""), ("voltage_v, current_a, air_c", "current_a, air_c")], ""),  # R I^2
+        ([("voltage: voltage_v, ", ""), ("voltage_v, current_a, air_c", "current_a, air_c"),
+          ("resistance_ohm: 5.0", "resistance_ohm: 0")], "without voltage_v"),
+        ([(", current: current_a", ""), ("voltage_v, current_a, air_c", "voltage_v, air_c")], "without current_a:"),
     ],
 )
 def test_check_says_where_the_power_is_unknown(config, capsys, pairs, lacks):
@@ -67,6 +68,7 @@ def test_check_refuses_what_would_hide_a_stopped_drive(config, capsys, old, new,
          "no coil_c: the model alone estimates"),
         ([("        pt100: air_c\n", ""), ("air_c, ", "")], "no air_c: the air counts as constant"),
         ([], "no output_reference_um .*calibrate. refuses"),
+        ([], r"no calibration stands behind the model .computed from actuator_thermal.yaml.*expected, not measured"),
     ],
 )  # fmt: skip
 def test_check_says_what_a_rig_without_a_sensor_does(config, capsys, pairs, said):
@@ -106,3 +108,63 @@ def test_check_warns_of_a_loop_without_real_time_priority(config, capsys):
 def test_every_shipped_configuration_asks_for_a_real_time_priority():
     for path in (*CONFIG.glob("*.yaml"), *(CONFIG / "examples").glob("*.yaml")):
         assert not re.search(r"^\s*priority: *0\b", path.read_text(), re.MULTILINE), path
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        ([("{voltage: voltage_v, ", "{")], r"\d+:\d+: protection.required names voltage_v, but no device of hal.devices has "
+         r"this role.*required: \[position_um, current_a, air_c, coil_c, amplifier_state\]"),
+        ([("required: [position_um, voltage_v, current_a, air_c, coil_c, amplifier_state]", "late_s: 0.1"),
+          ("{voltage: voltage_v, current", "{current")], r"protection.required names voltage_v \(the default\)"),
+        ([("        pt100: air_c\n", ""), ("roles: {state: amplifier_state, fault: amplifier_fault, supply: supply_v}",
+          "roles: {state: amplifier_state}"), ("required: [", "required: [supply_v, ")],
+         "names supply_v, air_c, but no device of hal.devices has these roles"),
+        ([("port: ../run/wire/encoder", "port: /dev/serial/by-id/usb-FTDI_XXXXXXXX-if00-port0")],
+         "port: 'XXXXXXXX' stands for your own adapter"),
+        ([("stale_s: {position_um: 0.1, voltage_v: 1", "stale_s: {position_um: 0.1, voltage_v: 0.001")],
+         r"protection.stale_s.voltage_v: 0.001 s is shorter than the time between two readings, [\d.]+ s \(rate_hz: "),
+        ([("frozen_s: {position_um: 0.5", "frozen_s: {position_um: 1 us")], "protection.frozen_s.position_um: 1e-06 s"),
+        ([("high: {position_um: 400", "high: {position_um: 400, supply_v: 500"), ("low:  {", "low:  {supply_v: 400, "),
+          ("required: [", "required: [supply_v, ")], "protection.low..high of supply_v .*no reading is valid"),
+        ([("  coil_limit_c: 80", "  coil_limit_c: 80\n  late_s: 1 ms")], "protection.late_s: 0.001 s is not longer"),
+    ],
+)  # fmt: skip
+def test_check_refuses_a_rig_that_could_never_be_armed(config, capsys, pairs, said):
+    change(config, *pairs)
+    assert main(["check", str(config)]) == 1
+    out = capsys.readouterr().out
+    assert re.search(rf"^error: {config}:.*{said}", out, re.MULTILINE), out
+    assert "NOT READY, the rig could not be armed" in out
+
+
+def test_a_limit_of_a_channel_that_is_not_required_only_warns(config, capsys):
+    change(config, ("stale_s: {", "stale_s: {supply_v: 0.0001, "))
+    assert main(["check", str(config)]) == 0
+    assert re.search(r"^warning: .*protection.stale_s.supply_v", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_each_axis_is_asked_for_its_own_channels(capsys, tmp_path):
+    shutil.copytree(CONFIG, tmp_path / "config")
+    path = tmp_path / "config/examples/stage.yaml"
+    text = path.read_text()
+    assert text.count("x.current_a") == 1
+    path.write_text(re.sub(r"[\w]+: x.current_a,? ?", "", text))
+    assert main(["check", str(path)]) == 1
+    out = capsys.readouterr().out
+    x, y = out.split("axis y:")
+    assert "names current_a" in x and "could not be armed" in x and "good. " in y
+
+
+def test_a_simulated_rig_is_asked_too(capsys, tmp_path):
+    shutil.copytree(CONFIG, tmp_path / "config")
+    path = tmp_path / "config/simulated.yaml"
+    change(path, ("required: [", "required: [supply_v, "))
+    assert main(["check", str(path)]) == 1
+    assert "names supply_v, but no output of the plant has this role" in capsys.readouterr().out
+
+
+def test_the_template_of_a_rig_is_not_good(capsys):
+    assert main(["check", str(CONFIG / "rig.yaml")]) == 1
+    out = capsys.readouterr().out
+    assert re.search(r"^error: .*port: 'XXXXXXXX'", out, re.MULTILINE) and "good" not in out

@@ -6,6 +6,7 @@ them.
 
 from __future__ import annotations
 
+import grp
 import os
 import re
 import sys
@@ -16,12 +17,14 @@ from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.lock import holder
+from thermoctl.daemon.offline.ready import obstacles
 from thermoctl.daemon.tick.arrival import expected_hz, slow
 from thermoctl.daemon.tick.assemble import (
     check_mode,
     compensator,
     lacks,
     law_parameters,
+    origin,
     power_warning,
     priority_warning,
 )
@@ -34,7 +37,10 @@ from thermoctl_hal.serial.latency_timer import latency_timer_ms
 
 
 def check(settings: Settings) -> int:
-    """Check the configuration, the model, the plant and the profiles; no hardware is touched."""
+    """Check the configuration, the model, the plant and the profiles; no hardware is touched.
+
+    Returns 1 where the rig could never be armed.
+    """
     if settings.axes:
         make_backends(settings)
         return _each_axis(settings, check)
@@ -43,18 +49,38 @@ def check(settings: Settings) -> int:
     make_backend(settings)
     check_mode(settings)
     without = lacks(settings)
+    found = list(obstacles(settings))
+    for in_the_way, line in found:
+        print(f"{'error' if in_the_way else 'warning'}: {line}")
     for warning in filter(None, (power_warning(settings), priority_warning(settings))):
         print(f"warning: {warning}")
+    bad = any(in_the_way for in_the_way, _ in found)
     print(
-        f"{settings.path}: good. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, model "
-        f"{settings.compensation.model or 'none'} ({model.kind}, order {len(model.A_minus_I)})"
+        f"{settings.path}: {'NOT READY, the rig could not be armed' if bad else 'good'}. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, "
+        + (
+            f"model {settings.compensation.model} ({model.kind}, order {len(model.A_minus_I)})"
+            if settings.compensation.model
+            else "no model: nothing is estimated and nothing is compensated"
+        )
     )
     if note := disk_warning(settings.recording):
         print(f"note: {note}")
     if settings.hal.backend == "devices":
-        for note in [*device_notes(settings), *without]:
+        for note in [*device_notes(settings), *without, *filter(None, (origin(settings), _group(settings)))]:
             print(f"note: {note}")
-    return 0
+    return int(bad)
+
+
+def _group(settings: Settings) -> str:
+    """Return a line where socket.group is no group of this system: the daemon would not start here."""
+    try:
+        grp.getgrnam(settings.socket.group or "root")
+    except KeyError:
+        return (
+            f"socket.group: no group '{settings.socket.group}' on this system: the daemon would not start here; "
+            "`thermoctl service install` makes the group thermoctl; leave it out for that of the daemon's user"
+        )
+    return ""
 
 
 def _each_axis(settings: Settings, examine: Callable[[Settings], int]) -> int:

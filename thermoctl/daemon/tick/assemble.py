@@ -16,6 +16,8 @@ from thermoctl.yamlfile import InputError, load
 from thermoctl_hal.profiles.bind import bind
 
 UNNAMED = RigSettings().name
+PLANT_FILES = (".yaml", ".yml", ".fmu")
+"""Endings of a model's sources that are plant files, not recordings."""
 
 
 def law_parameters(settings: Settings) -> Parameters:
@@ -94,7 +96,8 @@ def lacks(settings: Settings) -> list[str]:
     if "output_reference_um" not in roles:
         found.append(
             "no output_reference_um (second encoder): nothing proves the output's error, compensation.tune learns "
-            "nothing, `thermoctl calibrate` refuses; a model from `thermoctl plant linearise` compensates"
+            "nothing, `thermoctl calibrate` refuses; a model from `thermoctl plant linearise` compensates "
+            "(docs/how-to/without-a-second-encoder.md)"
         )
     if "air_c" not in roles:
         found.append(
@@ -147,6 +150,25 @@ def compensator(settings: Settings) -> CompensatorModel:
     from thermoctl.identify.modelfile import load_model
 
     return load_model(settings.compensation.model, settings.rig.name, settings.channels.point_names)
+
+
+def origin(settings: Settings) -> str:
+    """Return a line for a model that was computed from a plant file, '' for one fitted to recordings of the rig.
+
+    Raises InputError for an unreadable model.
+    """
+    if not settings.compensation.model:
+        return ""
+    from thermoctl.identify.modelfile import load_calibration
+
+    found = load_calibration(settings.compensation.model)
+    sources = found.fingerprints
+    if found.figures or any(Path(name).suffix not in PLANT_FILES for name in sources):
+        return ""
+    return (
+        f"no calibration stands behind the model (computed from {', '.join(sources) or 'no file'}): what it compensates is "
+        "expected, not measured; docs/how-to/without-a-second-encoder.md says how to judge it"
+    )
 
 
 def shared_name(settings: Settings) -> str:
