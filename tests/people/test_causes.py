@@ -147,6 +147,17 @@ CAUSES = [
 ]
 
 
+LOSSES = {
+    "encoder's cable pulled": "gone",
+    "encoder's checksums wrong": "garbled",
+    "encoder mute": "silent",
+    "CAN adapter pulled": "gone",
+    "drive without supply": "gone",
+    "CAN bus-off": "bus-off",
+}
+"""The way in which a reading is lost, by what is broken at the wire (control/losses.py); None: the others."""
+
+
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     return quick_settings(tmp_path_factory.mktemp("quick"))
@@ -190,6 +201,7 @@ def test_the_first_line_names_the_cause(
         lines = fault_lines(now["faults"])
         assert rig.state == "FAULT" and rig["enable"] == 0.0, (rig.state, rig.faults)
         assert first in lines[0], "\n".join(lines)
+        assert now["faults"][0]["loss"] == LOSSES.get(what) or kind is HazardRig, now["faults"][0]
         assert device in "\n".join([*lines, *message_lines(now)]), (lines, message_lines(now))
         assert lines[1].startswith("    -> ")
         line = re.sub(r" at \d\d:\d\d:\d\d, tick \d+", "", lines[0]).replace(f"{tmp_path}/", "/dev/")

@@ -86,9 +86,14 @@ class Standing:
     late_s: float = 0.0
 
     @property
-    def late_first(self) -> bool:
-        """True when late ticks must be named before the fault itself."""
+    def may_be_late(self) -> bool:
+        """True when late ticks may have caused this fault."""
         return self.late_s > 0.0 and self.name in LATE_MAY_CAUSE
+
+    @property
+    def is_timed(self) -> bool:
+        """True for a reading's fault that late ticks alone produce: too old, or changed too much since the last one."""
+        return self.name in _TIMED
 
 
 def channels_of(name: str, channels: Channels) -> tuple[str, ...]:

@@ -41,7 +41,7 @@ class Fault:
     @property
     def remedy(self) -> str:
         """How to check and how to cure, in one line."""
-        return f"{self.check}; {self.cure}"
+        return f"{self.check.rstrip('.')}; {self.cure}"
 
 
 _KINDS = {
@@ -73,7 +73,7 @@ _READINGS = {
         "stale": (
             1,
             "The encoder sends nothing or more slowly than its profile says; its cable is loose; or this machine was too late to read it.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "reseat the cable; set the encoder's output rate; where ticks were late see docs/how-to/real-time.md",
         ),
         "range": (
@@ -108,7 +108,7 @@ _READINGS = {
         "stale": (
             6,
             "The module answers too slowly or not at all, or the reference encoder stopped sending.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "reseat the cable; lower the number of registers polled, or raise stale_s to the module's real rate",
         ),
         "range": (
@@ -140,7 +140,7 @@ _READINGS = {
         "stale": (
             11,
             "The meter answers more slowly than the limit, or another device on the line keeps it busy.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "raise the baud rate or poll fewer registers; else raise stale_s to the meter's real rate",
         ),
         "range": (
@@ -172,7 +172,7 @@ _READINGS = {
         "stale": (
             16,
             "The sensor sends more slowly than the limit, or its frames are lost on a busy bus.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "set the sender's cycle time; else raise stale_s to its real rate",
         ),
         "range": (
@@ -204,7 +204,7 @@ _READINGS = {
         "stale": (
             21,
             "The module answers too slowly or not at all.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "reseat the line; else raise stale_s to the module's real rate",
         ),
         "range": (
@@ -236,7 +236,7 @@ _READINGS = {
         "stale": (
             26,
             "The thermocouple module answers too slowly or not at all.",
-            "compare the rate in `thermoctl doctor` with protection.stale_s and the profile's stale_after_s",
+            "the device's message says whether it is gone, silent or slow; `thermoctl status` names a slow reading with its rate",
             "reseat the line; poll fewer registers; else raise stale_s to the module's real rate",
         ),
         "range": (
@@ -430,7 +430,7 @@ _ROWS = (
         "fault",
         "the loop did not run for longer than protection.late_s (starved, stopped or suspended)",
         "Another program took the processor, the machine swapped or was suspended, or a virtual machine was paused.",
-        "`thermoctl latency` shows the histogram, `thermoctl doctor` the settings of the machine that cause it",
+        "`thermoctl latency` shows the histogram; after `thermoctl stop`, `thermoctl doctor` shows which settings of the machine cause it",
         "follow docs/how-to/real-time.md; stop the programs that take the loop's processor",
     ),
     Fault(

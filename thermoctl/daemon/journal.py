@@ -65,7 +65,7 @@ class Watcher:
             if not new >> faults.BIT[name] & 1 or f["t_s"] - self.told.get(name, -np.inf) < TELL_AGAIN_S:
                 continue
             self.told[name] = f["t_s"]
-            if f["late_s"]:
+            if f["late_first"]:
                 self.log("late", ms=round(f["late_s"] * 1e3), before=name, remedy=LATE_REMEDY)
             self.log(
                 f["severity"],

@@ -193,6 +193,11 @@ def _draws(random: np.random.Generator) -> Iterator[float]:
 def make_rig(settings: Settings) -> PlantRig:
     """Make the plant that simulates the hardware (`hal.truth`, else `hal.plant`). Raises InputError."""
     hal = settings.hal
+    if not (hal.truth or hal.plant):
+        raise InputError(
+            f"{settings.path}: hal.plant is missing: it names the plant file that is played; the plant's outputs carry the "
+            "roles' names, as in config/examples/spindle.plant.yaml (docs/how-to/devices.md#play-your-own-rig)"
+        )
     return PlantRig(
         Path(settings.path).parent / (hal.truth or hal.plant),
         settings.loop.period_s,

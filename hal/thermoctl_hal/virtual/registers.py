@@ -123,7 +123,7 @@ class ModbusOnWire(PtyDevice):
     def tick(self, now_s: float, tick: int) -> None:
         """Add to the means, and refresh the registers when they are due."""
         for i, b in enumerate(self.binding.bounds):
-            if channel_of(b.role) in MEANS:
+            if channel_of(b.role) in MEANS and b.role in self.rig.index:
                 self._sums[i] += self.rig.true(b.role)
         self._summed += 1
         if self._summed >= self._every:
@@ -134,7 +134,7 @@ class ModbusOnWire(PtyDevice):
             register = typed(b.channel.source, Register)
             if b.channel.name in self._open and register.sentinels:
                 raw: float | None = register.sentinels[0]
-            elif channel_of(b.role) in MEANS and self._summed:
+            elif channel_of(b.role) in MEANS and b.role in self.rig.index and self._summed:
                 mean = self._sums[i] / self._summed
                 raw = self.raw(b, self.rig.measured(self.rig.index[b.role], mean))
             else:

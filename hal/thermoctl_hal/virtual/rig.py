@@ -36,7 +36,7 @@ from thermoctl.yamlfile import InputError, suggest
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.profiles.bind import bind, check_rig
 from thermoctl_hal.simulated.rig import make_rig
-from thermoctl_hal.virtual.device import VirtualDevice
+from thermoctl_hal.virtual.device import VirtualDevice, channel_of
 from thermoctl_hal.virtual.encoder import EncoderStream
 from thermoctl_hal.virtual.plants import Plants, Readings
 from thermoctl_hal.virtual.registers import ModbusOnWire
@@ -46,6 +46,7 @@ from thermoctl_hal.virtual.text_meter import TextMeter
 MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
+OWN = ("amplifier_state", "amplifier_fault", "supply_v")  # what the devices know without the plant
 MAX_COMMAND = 400  # bytes of a line to the control socket
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
 _COLUMNS = (*_REFERENCE, "drive", "enabled")
@@ -93,10 +94,21 @@ class VirtualRig:
         self.devices = {b.name: virtual_device(b, self.plant, lines) for b in bindings}
         drives = [d for d in self.devices.values() if isinstance(d, DriveOnSlcan | DbcAmplifier)]
         self._amplifiers = {d.binding.axis: d for d in drives if d.binding.profile.amplifier is not None}
+        self.notes = [note for b in bindings if (note := self._silent(b, settings.hal.plant))]
         self.period_s = settings.loop.period_s
         self.stopping = False
         self.tick = self.slips = 0
         self.latest_s = 0.0  # largest delay of a tick
+
+    def _silent(self, binding: Binding, plant: str) -> str:
+        """Return a line that names the device's channels of which the plant knows nothing, else ''."""
+        roles = [b.role for b in binding.bounds if channel_of(b.role) not in OWN]
+        lacking = [r for r in roles if r not in self.plant.index]
+        if not lacking:
+            return ""
+        return (
+            f"note: {binding.name}: no output of {plant} is called {', '.join(lacking)}, and hal.roles names none: it reads 0 there"
+        )
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Connect every device and run in real time until `stopping`; disconnect every device afterwards."""
@@ -110,6 +122,8 @@ class VirtualRig:
                     "# the virtual rig's own truth; t is CLOCK_MONOTONIC\n"
                     f"t,{','.join(f'{a}.{n}' if a else n for a in self.axes for n in _COLUMNS)}\n"
                 )
+                for note in self.notes:
+                    announce(note)
                 for device in self.devices.values():
                     announce(f"{device.name}: {device.binding.port}")
                 announce(f"control: {self.run_dir / 'control.sock'}; reference: {reference.name}; ready")

@@ -51,13 +51,16 @@ def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
         if f.get("follows"):
             continue
         at = f"at {clock(f['wall_s'])}, tick {f['tick']}" if "wall_s" in f else ""
-        if f.get("late_s"):
+        late = f"{f.get('late_s', 0.0) * 1e3:.0f} ms"
+        if f.get("late_first"):
             lines += [
-                f"{f['severity']}: the machine was late by {f['late_s'] * 1e3:.0f} ms: {f['name']} {at} may be its consequence",
+                f"{f['severity']}: the machine was late by {late}: {f['name']} {at} may be its consequence",
                 f"    -> {LATE_REMEDY}",
             ]
         said = "; ".join(f.get("messages", ())) or f["meaning"]
         lines += [f"{f['severity']} {f['name']} {at}: {said}".replace(" :", ":"), f"    -> {f['remedy']}"]
+        if f.get("late_s") and not f.get("late_first"):
+            lines.append(f"    also: one tick was {late} late in the second before")
         after = [g["name"] for g in listed if g.get("follows") == f["name"]]
         if after:
             lines.append(f"    followed by: {', '.join(after)}")

@@ -12,13 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.control import causes, faults
+from thermoctl.control import causes, faults, losses
+from thermoctl.daemon.answers.display import clock
 from thermoctl.daemon.answers.sources import sources
 from thermoctl.daemon.tick.ring import CODE, CODE_S, TRIPS
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.channels import ERROR, STALE, STATUS_NAMES, Channels
 from thermoctl.rig.signals import AT, Row, fault_word, of_recording, recorded_states
 from thermoctl_hal.can.drive_errors import describe
+
+UNBOUND_MESSAGE = "no device of hal.devices has this role"
+"""As the back end of devices reports a role that nothing gives."""
 
 
 def verdict(status: int, kind: float) -> str:
@@ -116,43 +120,105 @@ def standing_faults(
     ]
     code = drive_code(shared, row)
     return [
-        {
-            "name": f.name,
-            "severity": causes.severity_of(f.name, trips),
-            "meaning": faults.BY_NAME[f.name].meaning,
-            "remedy": faults.BY_NAME[f.name].remedy,
-            "t_s": f.t_s,
-            "wall_s": begin_s + f.t_s,
-            "tick": f.tick,
-            "follows": cause,
-            "late_s": f.late_s if f.late_first and not cause else 0.0,
-            "messages": _messages(f, found, begin_s, code, shared.channels),
-        }
+        _described(f, cause, trips, float(row[AT["t_s"]]), begin_s, found, code, shared.channels)
         for f, cause in causes.in_order(standing, trips)
     ]
 
 
-def _messages(
+def _described(
     fault: causes.Standing,
-    found: Mapping[str, Any],
+    cause: str,
+    trips: int,
+    now_s: float,
     begin_s: float,
+    found: Mapping[str, Any],
     code: Mapping[str, Any] | None,
     channels: Channels,
-) -> list[str]:
-    """Return the devices' messages for this fault.
+) -> dict[str, Any]:
+    """Return a fault as `status` shows it. begin_s: seconds since 1970 at t_s = 0.
 
-    They come from its channels that are invalid now, or were invalid since the fault began.
+    `late_s` is the machine's delay before it, `late_first` whether that is the likely cause: only for a
+    reading whose device does not state a cause of its own.
     """
-    roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
-    texts: dict[str, str] = {}
+    row = faults.BY_NAME[fault.name]
+    hit = _hit(fault, found, begin_s, channels)
+    loss, reading = _loss(fault, hit, found, now_s)
+    is_stated = loss is not None and (loss.is_certain or (loss is not losses.SLOW and _is_old(reading)))
+    late_s = fault.late_s if fault.may_be_late and not cause else 0.0
+    return {
+        "name": fault.name,
+        "severity": causes.severity_of(fault.name, trips),
+        "meaning": row.meaning,
+        "remedy": row.remedy if loss is None else _remedy(loss, reading, begin_s + now_s),
+        "loss": None if loss is None else loss.name,
+        "t_s": fault.t_s,
+        "wall_s": begin_s + fault.t_s,
+        "tick": fault.tick,
+        "follows": cause,
+        "late_s": late_s,
+        "late_first": bool(late_s) and fault.is_timed and not is_stated,
+        "messages": _messages(fault, hit, found, code),
+    }
+
+
+def _hit(
+    fault: causes.Standing, found: Mapping[str, Any], begin_s: float, channels: Channels
+) -> list[tuple[str, str]]:
+    """Return (role, message) of the fault's channels that are invalid now, or were since the fault began."""
+    hit = []
     for role in causes.channels_of(fault.name, channels):
         r = found[role]
         since = r["message_wall_s"] is not None and r["message_wall_s"] >= begin_s + fault.t_s - 0.5
-        if r["message"] and (since or r["state"] not in ("OK", "ABSENT")):
-            words = r["message"].removeprefix(f"{role}: ")
-            tail = words.split(": ", 1)[-1]
-            roles.setdefault(tail, []).append(role)
-            texts.setdefault(tail, words)
+        if r["state"] == "ABSENT" and fault.name.endswith("_error") and not r["message"]:
+            hit.append((role, UNBOUND_MESSAGE))
+        elif r["message"] and (since or r["state"] not in ("OK", "ABSENT")):
+            hit.append((role, r["message"].removeprefix(f"{role}: ")))
+    return hit
+
+
+def _loss(
+    fault: causes.Standing, hit: list[tuple[str, str]], found: Mapping[str, Any], now_s: float
+) -> tuple[losses.Loss | None, Mapping[str, Any]]:
+    """Return how the fault's reading was lost, and that reading; None: its device reports its own state."""
+    kind = faults.BY_NAME[fault.name].kind
+    for role, message in hit if kind in ("error", "stale") else ():
+        if message == UNBOUND_MESSAGE:
+            return losses.UNBOUND, found[role]
+        loss, age_s = losses.loss_of(message), found[role]["age_s"]
+        has_arrived = kind == "stale" and age_s is not None and now_s - age_s > fault.t_s
+        if has_arrived and (loss is None or not loss.is_certain):
+            return losses.SLOW, found[role]
+        if loss is not None:
+            return loss, found[role]
+    return None, {}
+
+
+def _is_old(reading: Mapping[str, Any]) -> bool:
+    return (reading["age_s"] or 0.0) > losses.LATE_WINDOW_S
+
+
+def _remedy(loss: losses.Loss, reading: Mapping[str, Any], now_wall_s: float) -> str:
+    if loss not in (losses.UNBOUND, losses.SLOW) and reading["state"] == "OK":
+        return losses.BACK
+    since = ""
+    if reading["last"] is not None and reading["age_s"] is not None:
+        since = f"nothing was received since {clock(now_wall_s - reading['age_s'])}; "
+    return loss.remedy.format(since=since)
+
+
+def _messages(
+    fault: causes.Standing,
+    hit: list[tuple[str, str]],
+    found: Mapping[str, Any],
+    code: Mapping[str, Any] | None,
+) -> list[str]:
+    """Return the devices' messages for this fault, each once with its channels, the drive's error code first."""
+    roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
+    texts: dict[str, str] = {}
+    for role, words in hit:
+        tail = words.split(": ", 1)[-1]
+        roles.setdefault(tail, []).append(role)
+        texts.setdefault(tail, words)
     said = [f"{', '.join(roles[tail])}: {text}" for tail, text in texts.items()]
     if fault.name in ("amplifier_fault", "amplifier_error", "amplifier_not_following") and code is not None:
         said.insert(0, f"the drive reports {code['text']}")
