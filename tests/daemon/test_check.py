@@ -30,9 +30,18 @@ def change(config, *pairs):
     [
         ([], ""),
         ([("voltage: voltage_v, ", ""), ("voltage_v, current_a, air_c", "current_a, air_c")], ""),  # R I^2
-        ([("voltage: voltage_v, ", ""), ("voltage_v, current_a, air_c", "current_a, air_c"),
-          ("resistance_ohm: 5.0", "resistance_ohm: 0")], "without voltage_v"),
-        ([(", current: current_a", ""), ("voltage_v, current_a, air_c", "voltage_v, air_c")], "without current_a:"),
+        (
+            [
+                ("voltage: voltage_v, ", ""),
+                ("voltage_v, current_a, air_c", "current_a, air_c"),
+                ("resistance_ohm: 5.0", "resistance_ohm: 0"),
+            ],
+            "without voltage_v",
+        ),
+        (
+            [(", current: current_a", ""), ("voltage_v, current_a, air_c", "voltage_v, air_c")],
+            "without current_a:",
+        ),
     ],
 )
 def test_check_says_where_the_power_is_unknown(config, capsys, pairs, lacks):

@@ -10,8 +10,8 @@ from thermoctl.control import losses
 from thermoctl.control.arming import DISARM
 from thermoctl.control.causes import Standing
 from thermoctl.control.faults import FAULTS
-from thermoctl.daemon.display import fault_lines
-from thermoctl.daemon.snapshot import status
+from thermoctl.daemon.answers.display import fault_lines
+from thermoctl.daemon.answers.snapshot import status
 from thermoctl_hal.backend import ROLE, STALE
 
 BESIDE = {"status", "monitor", "latency", "arm", "disarm", "reload", "replay", "tune", "check"}
@@ -65,7 +65,9 @@ def test_the_remedy_is_that_of_the_devices_message(lost):
         lost.tick(30)
         found = voltage_fault(lost)
         assert found["loss"] == loss and remedy in found["remedy"], (message, found)
-        assert "raise" not in found["remedy"] or loss is None, "a lost device is no reason to weaken the protection"
+        assert "raise" not in found["remedy"] or loss is None, (
+            "a lost device is no reason to weaken the protection"
+        )
         assert message.split(": ", 1)[1] in "\n".join(fault_lines([found]))
         lost.backend.mend("voltage_v")
         lost.backend.message = ""
@@ -128,7 +130,9 @@ def test_a_required_channel_without_a_device_is_called_so(settings):
 
 
 def test_a_remedy_names_only_commands_that_run_beside_the_daemon():
-    for text in [f.remedy for f in FAULTS] + [loss.remedy for loss in (*losses.LOSSES, losses.SLOW, losses.UNBOUND)]:
+    for text in [f.remedy for f in FAULTS] + [
+        loss.remedy for loss in (*losses.LOSSES, losses.SLOW, losses.UNBOUND)
+    ]:
         for command in re.findall(r"(?<!after `thermoctl stop`, )`thermoctl (\w+)", text):
             assert command in BESIDE | {"stop"}, text
         assert not re.search(r"\.[;,]", text), text

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 LATE_WINDOW_S = 1.0
 """Late ticks are looked for in this time before a fault; a longer silence is the device's own."""
-BACK = (
-    "the reading is back: look at the device's plug and supply, then `thermoctl disarm` acknowledges the fault"
-)
+BACK = "the reading is back: look at the device's plug and supply, then `thermoctl disarm` acknowledges the fault"
 """Remedy for a reading that was lost and is valid again."""
 
 

@@ -106,9 +106,7 @@ class VirtualRig:
         lacking = [r for r in roles if r not in self.plant.index]
         if not lacking:
             return ""
-        return (
-            f"note: {binding.name}: no output of {plant} is called {', '.join(lacking)}, and hal.roles names none: it reads 0 there"
-        )
+        return f"note: {binding.name}: no output of {plant} is called {', '.join(lacking)}, and hal.roles names none: it reads 0 there"
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Connect every device and run in real time until `stopping`; disconnect every device afterwards."""

@@ -55,8 +55,9 @@ def check(settings: Settings) -> int:
     for warning in filter(None, (power_warning(settings), priority_warning(settings))):
         print(f"warning: {warning}")
     bad = any(in_the_way for in_the_way, _ in found)
+    verdict = "NOT READY, the rig could not be armed" if bad else "good"
     print(
-        f"{settings.path}: {'NOT READY, the rig could not be armed' if bad else 'good'}. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, "
+        f"{settings.path}: {verdict}. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, "
         + (
             f"model {settings.compensation.model} ({model.kind}, order {len(model.A_minus_I)})"
             if settings.compensation.model
