@@ -20,7 +20,7 @@ from thermoctl.daemon.journal import Log
 from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
-from thermoctl.daemon.tick.shared import BEATS, RESUMED, WARNINGS, Shared
+from thermoctl.daemon.tick.shared import BEATS, NO_MODEL, RESUMED, Shared
 from thermoctl.log import bind, console_log
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
@@ -74,9 +74,7 @@ def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
         guard(rigs, settings.parts)
 
         def warn(text: str) -> None:
-            """Log a warning and count it in the segment of each axis."""
-            for s in shared:
-                s.counters[WARNINGS] += 1
+            """Log a warning."""
             console_log("warning", what=text)
 
         kept = loops.become_real_time(settings, warn)
@@ -107,6 +105,7 @@ def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -
         shared.make_remarks(settings.loop.period_s),
         settings.channels,
     )
+    shared.counters[NO_MODEL] = float(not settings.compensation.model)
     _resume(settings, shared, rig)
     return rig
 

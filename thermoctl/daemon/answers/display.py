@@ -12,6 +12,10 @@ from typing import Any
 from thermoctl.daemon.answers.sources import FIXED_SOURCES
 
 LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
+MEASURED, EXPECTED, UNKNOWN = "measured", "expected, not measured", "unknown: no model, no second encoder"
+"""What stands behind the output and its error: `output_is` of a status."""
+NO_ESTIMATE, FREE = "NONE", "NOT CORRECTED"
+"""`estimates_state` of a rig without a model, and while the coil's reading is invalid."""
 _NORMAL = ("frames", "rows")  # counters of devices that count what is well
 
 
@@ -82,10 +86,14 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
         )
         for name in ("position_um", "output_reference_um", "power_w")
     }
-    mark = "" if status["estimates_state"] == "OK" else "?"
+    mark = "?" if status["estimates_state"] == FREE else ""
+    output = f"{shown_or['output_reference_um']} um"
+    if status["output_is"] != MEASURED:
+        expected = status["compensated_um"] if status["estimates_state"] != NO_ESTIMATE else None
+        output = f"{number(expected, 3)} um ({status['output_is']})"
     lines = [
         f"setpoint {number(status['setpoint_um'], 3)} um   position {shown_or['position_um']} um   compensation "
-        f"{number(status['compensation_um'], 3)}{mark} um   output {shown_or['output_reference_um']} um",
+        f"{number(status['compensation_um'], 3)}{mark} um   output {output}",
         f"drive {number(status['drive'], 3)}   power {shown_or['power_w']} W   air {shown(found['air_c'])} C",
         f"{'temperature, C':20}{'measured':>9}{'estimated':>11}{'age':>9}",
     ]
@@ -95,7 +103,7 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"{status['labels'][point]:20}{number(r['value'], 2):>9}{number(estimate, 2):>11}{span(r['age_s']):>9}{bad}"
         )
-    if status["estimates_state"] != "OK":
+    if mark:
         lines.append(
             f"estimates and compensation (?): not corrected by the coil's sensor for {span(found[status['coil']]['age_s'])}"
         )

@@ -9,7 +9,8 @@ import numpy as np
 
 from thermoctl.control import arming
 from thermoctl.daemon.answers import readings
-from thermoctl.daemon.tick.shared import RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
+from thermoctl.daemon.answers.display import EXPECTED, FREE, MEASURED, NO_ESTIMATE, UNKNOWN
+from thermoctl.daemon.tick.shared import NO_MODEL, RECORDER_LOST, RECORDER_ROWS, TUNING, Shared, percentiles
 from thermoctl.daemon.unsaved import unsaved
 from thermoctl.rig.channels import STATUS_NAMES
 from thermoctl.rig.signals import AT, Row
@@ -43,8 +44,9 @@ NUMBERS = (
 def status(shared: Shared) -> dict[str, Any]:
     """Return the newest row as `thermoctl status --json` prints it.
 
-    A number whose reading is invalid is null; `readings` has its state, age and message. Faults have the
-    cause first.
+    A number whose reading is invalid is null; `readings` has its state, age and message. Without a model
+    the estimates are null, too. `output_is` says whether the output is measured by a second encoder or only
+    expected by the model. Faults have the cause first.
     """
     row = shared.ring.newest()
     if row is None:
@@ -63,6 +65,10 @@ def status(shared: Shared) -> dict[str, Any]:
         name: float(row[i]) if math.isfinite(row[i]) and valid.get(name, True) else None
         for name, i in shared.row.index.items()
     }
+    estimated = not shared.counters[NO_MODEL]
+    if not estimated:
+        number |= dict.fromkeys(("expansion_um", *(f"{p}_est_c" for p in shared.channels.point_names)))
+    measured = found["output_reference_um"]["state"] != "ABSENT"
     busy = percentiles(shared.areas["busy"])
     return {
         "state": arming.STATES[int(row[AT["state"]])],
@@ -73,7 +79,8 @@ def status(shared: Shared) -> dict[str, Any]:
         **{name: number[name] for name in NUMBERS},
         "channels": {role: r["state"] for role, r in found.items()},
         "readings": found,
-        "estimates_state": "OK" if found[coil]["state"] == "OK" else "NOT CORRECTED",
+        "output_is": MEASURED if measured else EXPECTED if estimated else UNKNOWN,
+        "estimates_state": NO_ESTIMATE if not estimated else "OK" if found[coil]["state"] == "OK" else FREE,
         "coil": coil,
         "labels": shared.channels.labels,
         "drive_code": readings.drive_code(shared, row),

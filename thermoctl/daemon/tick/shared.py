@@ -84,9 +84,10 @@ def _areas(row: Row) -> tuple[tuple[str, str, tuple[int, ...]], ...]:
     )
 
 
-START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, WARNINGS, TUNING, RESUMED, RUN_S = range(8)
+START_S, LOOP_PID, RECORDER_LOST, RECORDER_ROWS, NO_MODEL, TUNING, RESUMED, RUN_S = range(8)
 """Indices in `counters`. TUNING: 1 + percent, 0 without tuning. RUN_S: start of this run, seconds since 1970.
 
+NO_MODEL: 1 on a rig without a compensator's model, of which nothing is estimated.
 RESUMED: 1 when the law started with the estimates of an earlier run.
 """
 BEATS = 8

@@ -48,7 +48,7 @@ from thermoctl.daemon.views.access import MIN_TOKEN, Policy, Refused, parse_addr
 from thermoctl.daemon.views.metrics import CONTENT_TYPE, metrics
 from thermoctl.daemon.views.watch import Watch
 from thermoctl.log import console_log
-from thermoctl.recording.history import history
+from thermoctl.recording.history import history, recorded_span
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.signals import AT
 from thermoctl.shipped import shipped
@@ -267,6 +267,7 @@ class Handler(BaseHTTPRequestHandler):
                 "setpoint_low_um": settings.control.setpoint_low_um,
                 "setpoint_high_um": settings.control.setpoint_high_um,
                 "sources": sources(settings.channels),
+                "recorded": recorded_span(settings.recording.directory, rig_identity(settings)),
                 "signals": [
                     {"name": s.name, "unit": s.unit, "meaning": s.meaning} for s in settings.row.signals
                 ],

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import textwrap
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -18,11 +19,20 @@ from rich.table import Table
 from rich.text import Text
 
 from thermoctl.configuration.settings import Settings
-from thermoctl.daemon.answers.display import fault_lines, message_lines, number, span
+from thermoctl.daemon.answers.display import (
+    EXPECTED,
+    FREE,
+    MEASURED,
+    fault_lines,
+    message_lines,
+    number,
+    span,
+)
 from thermoctl.daemon.control_socket import ask
 from thermoctl.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
+FEWEST = 4  # lines of faults that are shown on any terminal: the cause, its remedy and what follows
 KEPT = 240  # samples of a sparkline
 STYLE = {"ARMED": "bold green", "FAULT": "bold white on red", "READY": "bold yellow"}
 _READINGS = {
@@ -46,11 +56,11 @@ TRAILS = (
 def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
     """Return the output's error with compensation and without it, um; None unless armed.
 
-    The reference encoder measures the output; without one the law's estimate is used. Both are None while
-    that encoder is invalid.
+    The reference encoder measures the output; without one the law's estimate is used, which is expected and
+    not measured. Both are None while that encoder is invalid, and with neither encoder nor model.
     """
     reference, output = status.get("reference_um"), status.get("output_reference_um")
-    if status.get("channels", {}).get("output_reference_um", "ABSENT") == "ABSENT":
+    if status.get("output_is") == EXPECTED:
         output = status.get("compensated_um")
     if status["state"] != "ARMED" or reference is None or output is None:
         return None, None
@@ -88,8 +98,13 @@ def screen(
     trails: dict[str, deque[float]],
     width: int = 80,
     ramp: str = BLOCKS,
+    height: int = 0,
 ) -> Group:
-    """Draw one moment from the answers of the command socket, `width` characters wide."""
+    """Draw one moment from the answers of the command socket, `width` characters wide.
+
+    height: lines of the terminal, 0 for any number. The values come before the sparklines, and faults take
+    at most the lines that the values leave, but always FEWEST.
+    """
     faults = _faults(status["faults"])
     head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
     if "channels" not in status:
@@ -99,12 +114,35 @@ def screen(
         f"   recorder lost {status['recorder']['lost']}"
     )
     both = Table.grid(padding=(0, 3))
-    both.add_row(_numbers(status), _temperatures(status))
-    parts: list[RenderableType] = [head, *faults, Text(), both, Text(), _trails(trails, width, ramp)]
+    numbers, temperatures = _numbers(status), _temperatures(status)
+    both.add_row(numbers, temperatures)
+    left = height - 1 - max(numbers.row_count, temperatures.row_count + 1) if height else None
+    faults = _fitting(faults, width, left, FEWEST)
+    parts: list[RenderableType] = [head, *faults, *([] if faults and height else [Text()]), both]
+    left = None if left is None else left - max(1, len(faults))
+    below: list[RenderableType] = [Text(), _trails(trails, width, ramp)]
     if latency is not None:
-        parts.append(_timing(latency, ramp))
-    parts += [Text(line, style="yellow") for line in message_lines(status)]
+        below.append(_timing(latency, ramp))
+    if left is None or left >= len(TRAILS) + len(below) - 1:
+        parts += below
+        left = None if left is None else left - len(TRAILS) - len(below) + 1
+    parts += _fitting([Text(line, style="yellow") for line in message_lines(status)], width, left, 0)
     return Group(*parts, *([] if faults else [Text("no faults", style="green")]))
+
+
+def _fitting(texts: list[Text], width: int, room: int | None, fewest: int) -> list[Text]:
+    """Return the texts broken into lines of `width`, cut to `room` lines (None: all), but not below `fewest`."""
+    if room is None:
+        return texts
+    lines = [
+        Text(line, style=text.style)
+        for text in texts
+        for line in textwrap.wrap(text.plain, width, subsequent_indent="  ") or [""]
+    ]
+    room = max(room, fewest)
+    if len(lines) <= room or not room:
+        return lines[:room]
+    return [*lines[: room - 1], Text(f"... {len(lines) - room + 1} more lines: `thermoctl status`", "dim")]
 
 
 def _faults(standing: list[dict[str, Any]]) -> list[Text]:
@@ -136,8 +174,10 @@ def _numbers(status: dict[str, Any]) -> Table:
         ("innovation", status["innovation_c"], "K"),
         ("air", status["air_c"], "C"),
     ):
-        estimated = label in ("expansion", "compensation") and status["estimates_state"] != "OK"
-        table.add_row(f"{label} (?)" if estimated else label, _value(status, label, value), unit)
+        uncorrected = label in ("expansion", "compensation") and status["estimates_state"] == FREE
+        table.add_row(f"{label} (?)" if uncorrected else label, _value(status, label, value), unit)
+    if status["output_is"] != MEASURED:
+        table.add_row("errors are", Text(status["output_is"].partition(":")[0], style="yellow"), "")
     return table
 
 
@@ -153,7 +193,7 @@ def _value(status: dict[str, Any], label: str, value: float | None) -> Text:
 def _temperatures(status: dict[str, Any]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("temp., C", no_wrap=True)
-    estimated = status["estimates_state"] == "OK"
+    estimated = status["estimates_state"] != FREE
     for title in ("meas.", "est." if estimated else "est.?", "diff."):
         table.add_column(title, justify="right")
     table.add_column(no_wrap=True)  # age of an invalid reading
@@ -241,6 +281,7 @@ def show(settings: Settings, interval_s: float = 0.5, once: bool = False) -> int
         while True:
             status, latency = look(settings.socket.path)
             remember(trails, status)
-            live.update(screen(status, latency, trails, console.width, ramp), refresh=True)
+            view = screen(status, latency, trails, console.width, ramp, console.height)
+            live.update(view, refresh=True)
             time.sleep(interval_s)
     return 0

@@ -23,10 +23,12 @@ import numpy as np
 
 from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.answers.readings import hide_invalid
+from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN
+from thermoctl.daemon.answers.readings import hide_invalid, invalid
 from thermoctl.daemon.answers.snapshot import latency, status
-from thermoctl.daemon.tick.assemble import compensator, shared_name
+from thermoctl.daemon.tick.assemble import compensator, rig_identity, shared_name
 from thermoctl.daemon.tick.shared import Shared
+from thermoctl.recording.history import history, recorded_span
 from thermoctl.rig.signals import AT, fault_words
 from thermoctl.yamlfile import InputError
 
@@ -41,6 +43,7 @@ PAST = (
     "position_raw_um",
     "output_reference_um",
     "compensation_um",
+    "expansion_um",
     "innovation_c",
     "power_w",
 )
@@ -106,6 +109,7 @@ class Watch:
         self._position = self._captured = self._inode = 0
         self._bits: int | None = None  # fault bits of the row before; None before the first
         self._moved_s = time.monotonic()
+        self._is_new = True  # no daemon was seen yet: `past` is then that of the recording
         model = compensator(settings)
         self._noise_c2 = model.R_v if settings.compensation.model else math.nan
         self._gain = float(model.C[0] @ model.gain[:, 0])
@@ -135,6 +139,9 @@ class Watch:
     def look(self) -> None:
         """Read the rows since the last look; make a frame."""
         shared = self._attached()
+        if self._is_new and shared is None:
+            self.past.extend(recorded_past(self.settings))
+        self._is_new = False
         frame = _down() if shared is None else self._follow(shared)
         with self._changed:
             self.number, self.frame = self.number + 1, frame
@@ -189,8 +196,9 @@ class Watch:
         if len(rows):
             self._moved_s = now
             self._keep(rows, 0 if first else lost)
-            self._remember(rows)
         frame = {**status(shared), "ok": True, "silent_s": round(now - self._moved_s, 1)}
+        if len(rows):
+            self._remember(rows, frame.get("output_is", ""))
         frame["stale"] = frame["silent_s"] > SILENT_S
         newest = rows[-1] if len(rows) else shared.ring.newest()
         if newest is not None:
@@ -212,7 +220,7 @@ class Watch:
         share = self._gain * row[AT["kalman_gain"]]
         return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
-    def _remember(self, rows: np.ndarray) -> None:
+    def _remember(self, rows: np.ndarray, output_is: str) -> None:
         """Append the last row of each PAST_STEP_S to `past`, and drop rows older than a minute."""
         rows = rows[rows[:, _WALL] > rows[-1, _WALL] - PAST_S]
         step = np.floor(rows[:, _WALL] / PAST_STEP_S)
@@ -222,6 +230,7 @@ class Watch:
             point = {
                 "ok": True,
                 "state": arming.STATES[int(row[AT["state"]])],
+                "output_is": output_is,
                 **{n: _finite(column[k]) for n, column in columns.items()},
             }
             if self.past and row[_WALL] < self.past[-1]["wall_s"]:
@@ -270,6 +279,30 @@ class Watch:
                 self._captured, t_s, float(rows[k, _WALL]), names, known, bool(rows[-1, _T] > t_s + AFTER_S)
             )
         )
+
+
+def recorded_past(settings: Settings) -> list[dict[str, Any]]:
+    """Return the last minute that was recorded, as `Watch.past`; [] where nothing was."""
+    folder, rig = settings.recording.directory, rig_identity(settings)
+    span = recorded_span(folder, rig)
+    if span is None:
+        return []
+    begin_s, step_s = span[1] - PAST_S, PAST_STEP_S
+    columns: dict[str, dict[int, float]] = {}
+    for name in ("state", *PAST):
+        found = history(folder, rig, name, begin_s, span[1] + 1.0, 610, invalid, settings.row.names)
+        columns[name] = dict(zip((found.t // step_s).astype(int).tolist(), found.mean.tolist(), strict=True))
+    measured = any(math.isfinite(v) for v in columns["output_reference_um"].values())
+    output_is = MEASURED if measured else EXPECTED if settings.compensation.model else UNKNOWN
+    return [
+        {
+            "ok": True,
+            "state": arming.STATES[round(columns["state"][k])],
+            "output_is": output_is,
+            **{n: _finite(columns[n].get(k, math.nan)) for n in PAST},
+        }
+        for k in sorted(columns["state"])
+    ]
 
 
 def _down() -> dict[str, Any]:
