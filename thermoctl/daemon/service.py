@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pwd
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings, load_rig
@@ -33,6 +35,11 @@ SHARED = {  # files that every unit needs
     "thermoctl.tmpfiles": "etc/tmpfiles.d/thermoctl.conf",
     "99-thermoctl.rules": "etc/udev/rules.d/99-thermoctl.rules",
 }
+USER = "thermoctl"
+STATE, RUN = Path("/var/lib/thermoctl"), Path("/run/thermoctl")
+"""The folders that the unit may write (StateDirectory=, RuntimeDirectory=)."""
+HIDDEN = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))
+"""Folders that the unit does not see (ProtectHome=, PrivateTmp=)."""
 LIVE = Path("/run/systemd/system")  # exists if systemd runs the machine
 
 
@@ -199,15 +206,89 @@ def _program() -> Path:
     )
 
 
+def unseen(settings: Settings) -> list[str]:
+    """List what the unit could not read or write, each with its path and what to do.
+
+    The unit sees no home and no temporary folder (ProtectHome=, PrivateTmp=), and writes only below
+    /var/lib/thermoctl and /run/thermoctl (ProtectSystem=strict).
+    """
+    found, config = [], Path(settings.path).resolve()
+    program = {
+        "program": _program(),
+        "its Python": Path(sys.base_prefix),
+        "its package": Path(__file__).parents[1],
+    }
+    hidden = [f"{what} {path}" for what, path in program.items() if _is_below(path, HIDDEN)]
+    if hidden:
+        found.append(
+            f"{', '.join(hidden)}: install it with the system's Python: python3 -m venv /opt/thermoctl, then "
+            "/opt/thermoctl/bin/pip install the wheel (`make wheel`) with the extra [rig]"
+        )
+    if _is_below(config, HIDDEN):
+        found.append(f"configuration {config}: cp -r {config.parent} /etc/thermoctl")
+    else:
+        found += [
+            f"{path}: cp it to {config.parent} and name it there"
+            for path in _files(settings)
+            if _is_below(path, HIDDEN)
+        ]
+        if not config.stat().st_mode & 0o004 and config.stat().st_mode & 0o777:
+            found.append(f"configuration {config}: not readable for the user thermoctl: chmod o+r {config}")
+    for part in settings.parts:
+        for key, path, place in (
+            ("recording.directory", part.recording.directory, STATE / "recordings"),
+            (
+                "socket.path",
+                part.rig_socket or part.socket.path,
+                RUN / Path(part.rig_socket or part.socket.path).name,
+            ),
+            (
+                "compensation.model",
+                part.compensation.model if part.compensation.tune else "",
+                STATE / "models",
+            ),
+        ):
+            line = f"{key} {path}: write {key}: {place}"
+            if path and not _is_below(Path(path), (STATE, RUN)) and line not in found:
+                found.append(line)
+    return found
+
+
+def _files(settings: Settings) -> list[Path]:
+    """Return the files beside the configuration that the daemon reads: profiles, models, drawings."""
+    folder = Path(settings.path).resolve().parent
+    names = [p.compensation.model for p in settings.parts] + [settings.rig.drawing]
+    for device in settings.hal.devices:
+        profile = device.value.get("profile") if isinstance(device.value, dict) else None
+        names.append(str(profile.value) if profile is not None else "")
+    return sorted({(folder / name).resolve() for name in names if name})
+
+
+def _is_below(path: Path, folders: Iterable[Path]) -> bool:
+    resolved = path.absolute()
+    return any(folder in (p, *p.parents) for folder in folders for p in (resolved, resolved.resolve()))
+
+
 def install(config: Path, root: Path = Path("/")) -> int:
     """Install the unit of this configuration under `root`, with user, run directory and device rules.
 
     The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; other rigs' units
     stay as they are. systemd is informed where `root` is the running system. Raises InputError where a
-    file cannot be written or two rigs collide.
+    file cannot be written, two rigs collide, or the unit would not see its files; below another root that is
+    only printed.
     """
     settings = load_rig(config)
     config = config.resolve()
+    if hidden := unseen(settings):
+        text = (
+            "the unit sees no home and no temporary folder, and writes only below /var/lib/thermoctl and /run/thermoctl:"
+            + "".join(f"\n  {line}" for line in hidden)
+            + "\nthen `sudo /opt/thermoctl/bin/thermoctl service install --config /etc/thermoctl/"
+            + f"{config.name}`"
+        )
+        if root == Path("/"):
+            raise InputError(f"{config}: not installed: {text}")
+        print(f"warning: {config}: this unit could not start: {text}", file=sys.stderr)
     unit = _unit_name(settings, config, root)
     text = (SOURCE / FIRST).read_text().replace("@PROGRAM@", str(_program())).replace("@CONFIG@", str(config))
     files = {f"{UNITS}/{unit}": text} | {
@@ -227,8 +308,25 @@ def install(config: Path, root: Path = Path("/")) -> int:
         ):
             if shutil.which(command[0]):
                 subprocess.run(command, check=False)
+        _say_whether_the_user_exists()
         print(f"`systemctl enable --now {unit}` starts rig '{settings.rig.name}' now and at every boot")
+    elif root == Path("/"):
+        _say_whether_the_user_exists()
+        print(
+            f"systemd does not run here (a container, WSL or another init): nothing starts {unit}. `thermoctl start --config "
+            f"{config}` runs the rig in the background; your own supervisor takes `{_program()} run --config {config}` as "
+            "the user thermoctl"
+        )
     return 0
+
+
+def _say_whether_the_user_exists() -> None:
+    try:
+        pwd.getpwnam(USER)
+    except KeyError:
+        print(
+            f"no user {USER} was made here: `useradd --system --user-group --groups dialout --home-dir {STATE} {USER}` makes it"
+        )
 
 
 def _unit_name(settings: Settings, config: Path, root: Path) -> str:

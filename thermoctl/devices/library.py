@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.yamlfile import InputError, load, suggest
 from thermoctl_hal.base.profile import Profile
 from thermoctl_hal.profiles.read import load_profile
 
@@ -40,15 +40,21 @@ def find(name: str) -> Path:
     return known[name]
 
 
-def _row(name: str, profile: Profile) -> str:
-    kind = "amplifier" if profile.amplifier is not None else "sensor"
-    return f"{name:30} {profile.bus:14} {kind:9} {profile.vendor} {profile.model}"
+def _rows() -> Iterator[tuple[str, str]]:
+    """Return (row of the list, searched words) of each profile, from its text alone: no driver's package is needed."""
+    for folder in FOLDERS:
+        for path in sorted(shipped(folder).glob("*.yaml")):
+            p = load(path).plain()
+            kind = "amplifier" if "drive" in p else "sensor"
+            source = " ".join(str(p.get(key, "")) for key in ("manual", "edition", "place"))
+            row = f"{path.stem:30} {p['bus']:14} {kind:9} {p.get('vendor', '')} {p.get('model', '')}"
+            yield row, " ".join((row, source, *p["channels"])).lower()
 
 
 def list_all(_args: object = None) -> int:
     """Print every profile of the library."""
-    for name, profile in profiles():
-        print(_row(name, profile))
+    for row, _ in _rows():
+        print(row)
     return EXIT_OK
 
 
@@ -57,10 +63,9 @@ def search(words: list[str]) -> int:
 
     Searched are name, vendor, model, bus, manual and channels."""
     found = 0
-    for name, p in profiles():
-        text = " ".join((name, p.vendor, p.model, p.bus, p.source, *p.channels)).lower()
+    for row, text in _rows():
         if all(w.lower() in text for w in words):
-            print(_row(name, p))
+            print(row)
             found += 1
     if not found:
         print(f"no profile with {' '.join(words)}: write one with `thermoctl devices new`")

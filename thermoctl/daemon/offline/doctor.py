@@ -6,6 +6,7 @@ them.
 
 from __future__ import annotations
 
+import contextlib
 import grp
 import os
 import re
@@ -29,6 +30,7 @@ from thermoctl.daemon.tick.assemble import (
     priority_warning,
 )
 from thermoctl.daemon.tick.loop import become_real_time
+from thermoctl.extras import lacking
 from thermoctl.recording.writer import disk_warning
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
@@ -42,18 +44,23 @@ def check(settings: Settings) -> int:
     Returns 1 where the rig could never be armed.
     """
     if settings.axes:
-        make_backends(settings)
+        with _drivers(settings):
+            make_backends(settings)
         return _each_axis(settings, check)
     law_parameters(settings)
     model = compensator(settings)
-    make_backend(settings)
-    check_mode(settings)
-    without = lacks(settings)
-    found = list(obstacles(settings))
+    found: list[tuple[bool, str]] = []
+    notes: list[str] = []
+    with _drivers(settings):
+        check_mode(settings)
+        notes = lacks(settings)
+        if settings.hal.backend == "devices":
+            notes = [*device_notes(settings), *notes, *filter(None, (origin(settings), _group(settings)))]
+        found = list(obstacles(settings))
+        found += [(False, w) for w in (power_warning(settings), priority_warning(settings)) if w]
+        make_backend(settings)
     for in_the_way, line in found:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
-    for warning in filter(None, (power_warning(settings), priority_warning(settings))):
-        print(f"warning: {warning}")
     bad = any(in_the_way for in_the_way, _ in found)
     verdict = "NOT READY, the rig could not be armed" if bad else "good"
     print(
@@ -65,11 +72,21 @@ def check(settings: Settings) -> int:
         )
     )
     if note := disk_warning(settings.recording):
+        notes.append(note)
+    for note in notes:
         print(f"note: {note}")
-    if settings.hal.backend == "devices":
-        for note in [*device_notes(settings), *without, *filter(None, (origin(settings), _group(settings)))]:
-            print(f"note: {note}")
     return int(bad)
+
+
+@contextlib.contextmanager
+def _drivers(settings: Settings) -> Iterator[None]:
+    """Print a note where a driver's package is missing: the words are checked all the same, as far as they go."""
+    try:
+        yield
+    except ModuleNotFoundError as e:
+        if (line := lacking(e)) is None:
+            raise
+        print(f"note: {settings.path}: not every device was checked; running it {line}")
 
 
 def _group(settings: Settings) -> str:
