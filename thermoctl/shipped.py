@@ -48,4 +48,9 @@ def init(folder: str) -> int:
             shutil.copytree(shipped(source), part / name)
     for name in COPIED.values():
         print(f"wrote {Path(folder) / name}")
+    rig = Path(folder) / "config/rig.yaml"
+    print(
+        f"next: `thermoctl demo` shows the simulated rig; for your own, edit {rig} until `thermoctl check {rig}` says good "
+        f"(each line says what to do); without hardware `thermoctl virtual-rig --config {rig.with_name('wire.yaml')}` plays one"
+    )
     return 0

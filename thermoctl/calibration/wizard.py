@@ -283,7 +283,7 @@ class Wizard:
             tuning.write(Path(self.settings.path), gains_found, self.settings.axis)
         if not self._in_use(models):
             try:
-                values = {"model": self._model_option(models)}
+                values = {"model": f"{self._model_option(models)}  # written by `thermoctl calibrate`"}
                 tuning.write_values(Path(self.settings.path), "compensation", values, self.settings.axis)
             except InputError as e:  # the model is installed; the user has to enter its name
                 self.say(str(e))

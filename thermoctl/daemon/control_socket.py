@@ -68,12 +68,23 @@ class Connection:
             if isinstance(e, PermissionError):
                 text = "not allowed; the socket is for its group (see socket.group)"
             elif isinstance(e, FileNotFoundError | ConnectionRefusedError):
-                text = "the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
+                text = (
+                    "the daemon is not running; `thermoctl start` or `thermoctl run --config FILE`"
+                    + self._demo()
+                )
             elif isinstance(e, TimeoutError):
                 text = f"no answer within {self.timeout_s:g} s; see the daemon's log"
             else:
                 text = "the daemon broke the connection off; see its log"
             raise InputError(f"{self.path}: {text}") from None
+
+    def _demo(self) -> str:
+        """Return a hint where a demo with a rig of its own runs beside this one."""
+        rig = Path(self.path).parent / "demo/rig.yaml"
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as demo:
+            demo.connect(str(rig.with_suffix(".sock")))
+            return f"; a demo runs here on a rig of its own: --config {rig}"
+        return ""
 
 
 def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:

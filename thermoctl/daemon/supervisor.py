@@ -40,7 +40,14 @@ from thermoctl.daemon.processes import (
     restart,
 )
 from thermoctl.daemon.tick import loop as loops
-from thermoctl.daemon.tick.assemble import check_mode, compensator, law_parameters, rig_identity, shared_name
+from thermoctl.daemon.tick.assemble import (
+    check_mode,
+    compensator,
+    law_parameters,
+    rig_identity,
+    shared_name,
+    unknown_group,
+)
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.daemon.unsaved import Unsaved
 from thermoctl.log import bind, console_log
@@ -97,6 +104,8 @@ def run(settings: Settings, log: Log = console_log) -> int:
             "warning",
             what="the law runs interpreted, not compiled: far too slow for a rig; run `make install`",
         )
+    if line := unknown_group(settings):
+        raise InputError(f"{settings.path}: {line}")
     lock = hold(settings)
     for part in settings.parts:
         compensator(part)

@@ -265,8 +265,9 @@ def write(config: Path, proposed: Gains, axis: str = "") -> None:
 
 
 def write_values(config: Path, section: str, values: dict[str, str], axis: str = "") -> None:
-    """Write values into a section of a configuration, other lines and all comments untouched.
+    """Write values into a section of a configuration; other lines and the comments stay.
 
+    A value with a comment of its own, 'VALUE  # COMMENT', also replaces the old comment.
     axis: into the section of this axis; section and keys are added where the axis has none of its own.
     Raises InputError when the place has no lines of its own, or without an axis names no such key."""
     text = config.read_text(encoding="utf-8")
@@ -287,7 +288,7 @@ def write_values(config: Path, section: str, values: dict[str, str], axis: str =
     body = text[begin:end]
     for name, value in reversed(values.items()):  # a new line goes before those that are there
         line = re.compile(rf"^({indent}{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
-        body, n = line.subn(rf"\g<1>{value}\g<2>", body)
+        body, n = line.subn(rf"\g<1>{value}" + ("" if " #" in value else r"\g<2>"), body)
         if n == 0 and axis:
             body = f"{indent}{name}: {value}\n{body}"
         elif n != 1:

@@ -7,7 +7,6 @@ them.
 from __future__ import annotations
 
 import contextlib
-import grp
 import os
 import re
 import sys
@@ -28,10 +27,12 @@ from thermoctl.daemon.tick.assemble import (
     origin,
     power_warning,
     priority_warning,
+    unknown_group,
 )
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.extras import lacking
 from thermoctl.recording.writer import disk_warning
+from thermoctl.rig.channels import AMPLIFIER_STATES
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
 from thermoctl_hal.rig.make import device_notes, fast_devices, make_backend, make_backends
@@ -55,7 +56,11 @@ def check(settings: Settings) -> int:
         check_mode(settings)
         notes = lacks(settings)
         if settings.hal.backend == "devices":
-            notes = [*device_notes(settings), *notes, *filter(None, (origin(settings), _group(settings)))]
+            notes = [
+                *device_notes(settings),
+                *notes,
+                *filter(None, (origin(settings), unknown_group(settings))),
+            ]
         found = list(obstacles(settings))
         found += [(False, w) for w in (power_warning(settings), priority_warning(settings)) if w]
         make_backend(settings)
@@ -87,18 +92,6 @@ def _drivers(settings: Settings) -> Iterator[None]:
         if (line := lacking(e)) is None:
             raise
         print(f"note: {settings.path}: not every device was checked; running it {line}")
-
-
-def _group(settings: Settings) -> str:
-    """Return a line where socket.group is no group of this system: the daemon would not start here."""
-    try:
-        grp.getgrnam(settings.socket.group or "root")
-    except KeyError:
-        return (
-            f"socket.group: no group '{settings.socket.group}' on this system: the daemon would not start here; "
-            "`thermoctl service install` makes the group thermoctl; leave it out for that of the daemon's user"
-        )
-    return ""
 
 
 def _each_axis(settings: Settings, examine: Callable[[Settings], int]) -> int:
@@ -184,11 +177,17 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
         problem = backend.problem(role) or slow(role, rate_hz, expected, found.reads / seconds)
         print(
             f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f} Hz"
-            + (f"   {problem}" if problem else "")
+            + (f"   {problem or _in_words(role, sample.value[k])}".rstrip())
         )
     if counters := backend.counters():
         print("counters: " + ", ".join(f"{name} {count}" for name, count in counters.items()))
     return bad
+
+
+def _in_words(role: str, value: float) -> str:
+    """Return what the amplifier's state means, '' for other channels."""
+    known = role == "amplifier_state" and value in range(len(AMPLIFIER_STATES))
+    return AMPLIFIER_STATES[int(value)] if known else ""
 
 
 @dataclass(frozen=True)

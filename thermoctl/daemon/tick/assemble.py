@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import zlib
 from dataclasses import fields
 from pathlib import Path
@@ -169,6 +170,18 @@ def origin(settings: Settings) -> str:
         f"no calibration stands behind the model (computed from {', '.join(sources) or 'no file'}): what it compensates is "
         "expected, not measured; docs/how-to/without-a-second-encoder.md says how to judge it"
     )
+
+
+def unknown_group(settings: Settings) -> str:
+    """Return a line where socket.group is no group of this system, so that the daemon cannot start; else ''."""
+    try:
+        grp.getgrnam(settings.socket.group or "root")
+    except KeyError:
+        return (
+            f"socket.group: no group '{settings.socket.group}' on this system: the daemon would not start here; "
+            "`thermoctl service install` makes the group thermoctl; leave it out for that of the daemon's user"
+        )
+    return ""
 
 
 def shared_name(settings: Settings) -> str:

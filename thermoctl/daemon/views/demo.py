@@ -130,7 +130,7 @@ class _Demo:
         self.page = ""
         self.growth = Growth()
         self.slips: deque[tuple[float, int]] = deque()
-        self.faulty = False
+        self.faulty = self.was_ready = False
 
     def ask(self, command: str, **more: Any) -> dict[str, Any]:
         """Send a request to our own child. Raises InputError where it does not hold the lock."""
@@ -147,6 +147,7 @@ class _Demo:
         if not self._ready():
             sys.stderr.write(self.child.said())
             return 3
+        self.was_ready = True
         answer = self.ask("arm")
         if not answer["ok"]:
             raise InputError(answer["error"])
@@ -160,6 +161,8 @@ class _Demo:
             self.ask("disarm")
         self.child.terminate()
         self.child.wait(STOP_S)
+        if not self.was_ready:
+            return
         say = self.console.print
         say(self.growth.sentence(), highlight=False)
         folder = Path(self.settings.path).parent
