@@ -12,7 +12,7 @@ from thermoctl.control.causes import Standing
 from thermoctl.control.faults import FAULTS
 from thermoctl.daemon.answers.display import fault_lines
 from thermoctl.daemon.answers.snapshot import status
-from thermoctl_hal.backend import ROLE, STALE
+from thermoctl_hal.base.backend import ROLE, STALE
 
 BESIDE = {"status", "monitor", "latency", "arm", "disarm", "reload", "replay", "tune", "check"}
 """Commands that do their work while a daemon holds the rig."""

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from thermoctl.configuration.settings import AXES, Settings
 from thermoctl.yamlfile import Node, load
-from thermoctl_hal.binding import Bound, bind
-from thermoctl_hal.simulated import make_rig
+from thermoctl_hal.base.binding import Bound
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.simulated.rig import make_rig
 
 PLACEHOLDER = re.compile(r"X{4,}|Y{4,}|<[^>]*>")
 """Text of a template's port that stands for the user's own."""
