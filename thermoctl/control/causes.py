@@ -92,7 +92,7 @@ class Standing:
 
     @property
     def is_timed(self) -> bool:
-        """True for a reading's fault that late ticks alone produce: too old, or changed too much since the last one."""
+        """True for a fault that late ticks alone produce: a reading too old, or changed too much."""
         return self.name in _TIMED
 
 

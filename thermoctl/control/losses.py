@@ -1,4 +1,4 @@
-"""Ways in which a reading is lost, told from the device's own message, each with its remedy. One table. Pure.
+"""Ways in which a reading is lost, read from the device's own message, each with its remedy. Pure.
 
 A reading that is gone, one that is silent and one that is slow give the same fault (`..._stale`, `..._error`)
 and need three remedies. A remedy names only commands that can run beside the daemon.
@@ -17,7 +17,9 @@ BACK = "the reading is back: look at the device's plug and supply, then `thermoc
 
 @dataclass(frozen=True)
 class Loss:
-    """One way to lose a reading. words: what the driver's message then contains; {since}: the last reading's time."""
+    """One way to lose a reading.
+
+    words: pattern of the driver's message. remedy: {since} stands for the time of the last reading."""
 
     name: str
     meaning: str
@@ -75,9 +77,9 @@ LOSSES = (
         "power the device, check its cable, baud rate and address; {since}the daemon goes on asking",
     ),
 )
-"""The losses that a message tells, the first whose words it contains."""
+"""The losses that a message reports, the first whose words it contains."""
 
 
 def loss_of(message: str) -> Loss | None:
-    """Return the loss that a driver's message tells, or None: the device reports its own state."""
+    """Return the loss that a driver's message reports; None where the device reports its own state."""
     return next((loss for loss in LOSSES if re.search(loss.words, message)), None)

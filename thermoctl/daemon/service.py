@@ -274,8 +274,8 @@ def install(config: Path, root: Path = Path("/")) -> int:
 
     The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; other rigs' units
     stay as they are. systemd is informed where `root` is the running system. Raises InputError where a
-    file cannot be written, two rigs collide, or the unit would not see its files; below another root that is
-    only printed.
+    file cannot be written or two rigs collide. It also does where the unit would not see its files; below
+    another root that is only a warning.
     """
     settings = load_rig(config)
     config = config.resolve()

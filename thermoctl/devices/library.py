@@ -41,7 +41,7 @@ def find(name: str) -> Path:
 
 
 def _rows() -> Iterator[tuple[str, str]]:
-    """Return (row of the list, searched words) of each profile, from its text alone: no driver's package is needed."""
+    """Return (row of the list, searched words) of each profile, from its text alone."""
     for folder in FOLDERS:
         for path in sorted(shipped(folder).glob("*.yaml")):
             p = load(path).plain()

@@ -132,7 +132,9 @@ def _within(directory: Path, kind: str, begin_s: float, end_s: float) -> list[Pa
 
 
 def recorded_span(directory: str | Path, rig: str) -> tuple[float, float] | None:
-    """Return (start of the rig's oldest recording, last write of its newest), seconds since 1970; None without any."""
+    """Return (start of the oldest recording, last write of the newest), seconds since 1970.
+
+    None where the rig has none."""
     paths = [p for p in _within(Path(directory), TIER, 0.0, 1e11) if rig_of(p) == rig]
     try:
         return (min(map(_start_s, paths)), max(p.stat().st_mtime for p in paths)) if paths else None

@@ -46,7 +46,7 @@ from thermoctl_hal.virtual.text_meter import TextMeter
 MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
-OWN = ("amplifier_state", "amplifier_fault", "supply_v")  # what the devices know without the plant
+OWN = ("amplifier_state", "amplifier_fault", "supply_v")  # roles that need no output of the plant
 MAX_COMMAND = 400  # bytes of a line to the control socket
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
 _COLUMNS = (*_REFERENCE, "drive", "enabled")

@@ -13,7 +13,7 @@ from thermoctl.daemon.answers.sources import FIXED_SOURCES
 
 LATE_REMEDY = "docs/how-to/real-time.md: stop other programs on the loop's processor; `thermoctl latency` shows the lateness"
 MEASURED, EXPECTED, UNKNOWN = "measured", "expected, not measured", "unknown: no model, no second encoder"
-"""What stands behind the output and its error: `output_is` of a status."""
+"""Origin of the output and its error: `output_is` of a status."""
 NO_ESTIMATE, FREE = "NONE", "NOT CORRECTED"
 """`estimates_state` of a rig without a model, and while the coil's reading is invalid."""
 _NORMAL = ("frames", "rows")  # counters of devices that count what is well

@@ -137,8 +137,8 @@ def _described(
 ) -> dict[str, Any]:
     """Return a fault as `status` shows it. begin_s: seconds since 1970 at t_s = 0.
 
-    `late_s` is the machine's delay before it, `late_first` whether that is the likely cause: only for a
-    reading whose device does not state a cause of its own.
+    `late_s` is the machine's delay before it. `late_first`: that is the likely cause, because the reading's
+    device states none of its own.
     """
     row = faults.BY_NAME[fault.name]
     hit = _hit(fault, found, begin_s, channels)
@@ -212,7 +212,7 @@ def _messages(
     found: Mapping[str, Any],
     code: Mapping[str, Any] | None,
 ) -> list[str]:
-    """Return the devices' messages for this fault, each once with its channels, the drive's error code first."""
+    """Return the devices' messages, each once with its channels; the drive's error code first."""
     roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
     texts: dict[str, str] = {}
     for role, words in hit:

@@ -44,10 +44,12 @@ def check(settings: Settings) -> int:
 
     Returns 1 where the rig could never be armed.
     """
-    if settings.axes:
-        with _drivers(settings):
-            make_backends(settings)
-        return _each_axis(settings, check)
+    with _drivers(settings):
+        make_backends(settings)  # of a rig with axes: that of each one
+    return _each_axis(settings, _check) if settings.axes else _check(settings)
+
+
+def _check(settings: Settings) -> int:
     law_parameters(settings)
     model = compensator(settings)
     found: list[tuple[bool, str]] = []
@@ -63,7 +65,6 @@ def check(settings: Settings) -> int:
             ]
         found = list(obstacles(settings))
         found += [(False, w) for w in (power_warning(settings), priority_warning(settings)) if w]
-        make_backend(settings)
     for in_the_way, line in found:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
     bad = any(in_the_way for in_the_way, _ in found)
@@ -85,7 +86,7 @@ def check(settings: Settings) -> int:
 
 @contextlib.contextmanager
 def _drivers(settings: Settings) -> Iterator[None]:
-    """Print a note where a driver's package is missing: the words are checked all the same, as far as they go."""
+    """Print a note where a driver's package is missing; what needs none is checked."""
     try:
         yield
     except ModuleNotFoundError as e:

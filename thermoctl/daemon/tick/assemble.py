@@ -154,7 +154,7 @@ def compensator(settings: Settings) -> CompensatorModel:
 
 
 def origin(settings: Settings) -> str:
-    """Return a line for a model that was computed from a plant file, '' for one fitted to recordings of the rig.
+    """Return a line for a model computed from a plant file; '' for one fitted to recordings.
 
     Raises InputError for an unreadable model.
     """
@@ -173,7 +173,7 @@ def origin(settings: Settings) -> str:
 
 
 def unknown_group(settings: Settings) -> str:
-    """Return a line where socket.group is no group of this system, so that the daemon cannot start; else ''."""
+    """Return a line where socket.group is no group of this system; else ''."""
     try:
         grp.getgrnam(settings.socket.group or "root")
     except KeyError:

@@ -131,7 +131,7 @@ def screen(
 
 
 def _fitting(texts: list[Text], width: int, room: int | None, fewest: int) -> list[Text]:
-    """Return the texts broken into lines of `width`, cut to `room` lines (None: all), but not below `fewest`."""
+    """Return the texts in lines of `width`, cut to `room` lines (None: all), at least `fewest`."""
     if room is None:
         return texts
     lines = [
