@@ -86,7 +86,7 @@ def _check(settings: Settings) -> int:
 
 @contextlib.contextmanager
 def _drivers(settings: Settings) -> Iterator[None]:
-    """Print a note where a driver's package is missing; what needs none is checked."""
+    """Print a note where a driver's package is missing; other checks go on."""
     try:
         yield
     except ModuleNotFoundError as e:
