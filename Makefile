@@ -211,6 +211,10 @@ hazards: develop                   # every hazard with its limit; measured resul
 causes: install                    # 27 injected causes, the first line shown for each, its remedy: docs/proof/causes.md
 	THERMOCTL_CAUSES=docs/proof/causes.md $(BIN)/python -m pytest -m slow tests/people/test_causes.py
 
+.PHONY: first-rig
+first-rig: develop                 # an own rig on played devices, from an empty folder to ARMED and compensating, with times
+	$(BIN)/python tests/walkthrough/first_rig.py
+
 .PHONY: walkthrough
 walkthrough:                       # a new user's walk: a clean clone, every command of README, a diagnosed recording
 	$(PYTHON) tests/walkthrough/walk.py

@@ -169,6 +169,55 @@ def test_a_second_rig_gets_a_unit_of_its_own(installed, config, tmp_path, capsys
     assert not [p for p in installed.rglob("*") if p.is_file()]
 
 
+def home_rig(folder, **more):
+    """A rig as in a clone in a home folder: program, configuration, recordings and socket lie there."""
+    folder.mkdir(parents=True)
+    path = folder / "rig.yaml"
+    path.write_text(
+        (ROOT / "config/simulated.yaml").read_text()
+        .replace("plants/", f"{ROOT}/config/plants/").replace("models/", f"{ROOT}/config/models/")
+    )  # fmt: skip
+    return path
+
+
+def test_the_running_system_gets_no_unit_that_cannot_see_its_files(tmp_path, monkeypatch, capsys):
+    """Before, seven lines `wrote ...` and exit 0 (review_user_3 A3)."""
+    rig = home_rig(tmp_path / "pi/rig/config")
+    monkeypatch.setattr(service, "HIDDEN", (tmp_path,))
+    monkeypatch.setattr(service, "_program", lambda: tmp_path / "pi/.venv/bin/thermoctl")
+    monkeypatch.setattr(Path, "write_text", lambda *a, **k: pytest.fail("something was written"))
+    assert main(["service", "install", "--config", str(rig)]) == 2
+    said = capsys.readouterr().err
+    for words in (
+        f"program {tmp_path}/pi/.venv/bin/thermoctl", "/opt/thermoctl",
+        f"configuration {rig}", "/etc/thermoctl",
+        f"recording.directory {tmp_path}/pi/rig/recordings: write recording.directory: /var/lib/thermoctl/recordings",
+        f"socket.path {tmp_path}/pi/rig/run/", "write socket.path: /run/thermoctl/",
+    ):  # fmt: skip
+        assert words in said, (words, said)
+
+
+def test_below_another_root_the_same_is_a_warning(installed, config, capsys):
+    assert (installed / "etc/systemd/system/thermoctl.service").exists()
+    main(["service", "install", "--config", str(config), "--root", str(installed)])
+    assert "this unit could not start" in capsys.readouterr().err
+
+
+def test_files_in_system_folders_are_seen(tmp_path, monkeypatch):
+    rig = home_rig(tmp_path / "etc/thermoctl")
+    rig.write_text(
+        re.sub(
+            r"path: .*",
+            "path: /run/thermoctl/rig.sock",
+            rig.read_text().replace("../recordings", "/var/lib/thermoctl/rec"),
+        )
+    )
+    monkeypatch.setattr(service, "HIDDEN", (tmp_path / "home",))
+    assert service.unseen(load_settings(rig)) == []
+    rig.chmod(0o600)
+    assert ["chmod o+r" in line for line in service.unseen(load_settings(rig))] == [True]
+
+
 @pytest.fixture
 def systemd(installed, monkeypatch, tmp_path):
     """systemd as far as the commands use it: units below `installed`, and what systemctl was asked to do."""

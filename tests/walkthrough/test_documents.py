@@ -42,8 +42,10 @@ def test_links_of_the_documents_lead_somewhere():
             assert target.startswith("http") or (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-@pytest.mark.parametrize(
-    "page", [p for p in pages() if any(b.mark == "runs" for b in blocks(p))], ids=lambda p: p.stem
+@pytest.mark.parametrize(  # first-rig.md begins in a folder of its own: tests/walkthrough/first_rig.py
+    "page",
+    [p for p in pages() if p.stem != "first-rig" and any(b.mark == "runs" for b in blocks(p))],
+    ids=lambda p: p.stem,
 )
 def test_a_page(page, folder):
     for block in blocks(page):
