@@ -99,6 +99,7 @@ def test_natural_convection_is_named_placed_and_worth_it_on_unseen_data(tmp_path
         "before",
         "refit_only",
         "after",
+        "converged",
         "held_out_before",
         "held_out_refit_only",
         "held_out_after",

@@ -110,7 +110,7 @@ def test_laplace_agrees_with_importance_sampling(name):
     spread = np.linalg.inv(hessian + 1e-9 * np.eye(len(found.fit.z)))
     draw = multivariate_t(found.fit.z, 1.5 * spread, df=6, seed=5)
     z = draw.rvs(300).reshape(300, -1)
-    low, high = posterior.bounds()
+    low, high = posterior.bounds
     inside = np.all((z >= low) & (z <= high), axis=1)
     weight = [evidence_at(posterior, q, found) - draw.logpdf(q) for q in z[inside]]
     sampled = float(logsumexp(weight) - np.log(len(z)))

@@ -175,7 +175,7 @@ def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeyp
 
     monkeypatch.setattr(Problem, "evaluate", counted)
     for bent in (0.75, 0.0):
-        monkeypatch.setattr("thermoctl.plant.refit.MAX_ACCELERATION", bent)
+        monkeypatch.setattr("thermoctl.plant.climb.CURVED", bent)
         slopes.append(0)
         costs = [
             fit(model, [model.excitation(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost

@@ -23,10 +23,11 @@ from thermoctl.diagnose.curvature import at_bound, deviations, kept, relieved
 from thermoctl.diagnose.memory import Past, PlacedBefore
 from thermoctl.diagnose.noise import Averaged, averaged
 from thermoctl.diagnose.onsets import moved
-from thermoctl.diagnose.posterior import Hypothesis, bounded_step, gaussian
+from thermoctl.diagnose.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnose.posterior import Placed as Placed
 from thermoctl.diagnose.posterior import Posterior as Posterior
 from thermoctl.plant import refit
+from thermoctl.plant.climb import Climbed, bounded_step
 from thermoctl.plant.estimate import updated
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit
@@ -165,13 +166,13 @@ def _refitted(
     z = start.z.copy()
     z[posterior.shared] = posterior.past.z
     top = posterior.climb(z, goal)
-    if parent and top[1].log_likelihood < parent.log_likelihood:
+    if parent and top.spot.found.average.log_likelihood < parent.log_likelihood:
         try:
             other = posterior.climb(_beside(posterior, parent), goal)
         except SimulationError:
             other = top
-        top = max(top, other, key=lambda t: t[1].log_likelihood + posterior.prior(t[0]))
-    return _weighed(case, posterior, *top, start)
+        top = max(top, other, key=lambda t: t.spot.height)
+    return _weighed(case, posterior, top, start)
 
 
 def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
@@ -232,7 +233,7 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
     A parameter that an effect replaces goes towards zero. Its logarithmic scale would bend that path."""
     problem = posterior.problem
     values, _ = problem.unpack(z)
-    low, high = (bound - z for bound in posterior.bounds())
+    low, high = (bound - z for bound in posterior.bounds)
     at, slope = z.copy(), np.ones(len(z))
     for k, (q, r) in enumerate(problem.unknowns[: problem.n_parameters]):
         scale = problem.scales[q]
@@ -240,7 +241,8 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
         slope[k] = scale.slope(at[k])
         low[k], high[k] = (scale.low - at[k]) / slope[k], (scale.high - at[k]) / slope[k]
     zero = np.zeros(len(free))
-    step = bounded_step(zero, now.gradient[free], now.matrix[np.ix_(free, free)], low[free], high[free])
+    part, bounds = now.matrix[np.ix_(free, free)], (low[free], high[free])
+    step, _ = bounded_step(zero, now.gradient[free], part, 0.0, bounds)
     out = z.copy()
     for k, change in zip(free, step, strict=True):
         if k < problem.n_parameters:
@@ -251,23 +253,15 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
     return out
 
 
-def _weighed(
-    case: Case,
-    posterior: Posterior,
-    z: np.ndarray,
-    average: Averaged,
-    powers: list[np.ndarray],
-    matrix: np.ndarray,
-    errors: list[np.ndarray],
-    rough: Fit,
-) -> Fitted:
+def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
     """Laplace's evidence at the maximum."""
-    problem = posterior.problem
+    problem, z, matrix = posterior.problem, top.spot.z, top.matrix
+    average, powers, errors = top.spot.found.average, top.spot.found.powers, top.spot.found.errors
     values, dx0 = problem.unpack(z)
     own, parameters = np.ones(len(z), bool), np.arange(len(z)) < problem.n_parameters
     own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
-    confined = relieved(confined, posterior.relief(z, posterior.rows(errors), average))
+    confined = relieved(confined, posterior.relief(z, top.spot.found.rows, average))
     bounds = at_bound(problem, z)
     sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
@@ -281,10 +275,12 @@ def _weighed(
         kept(matrix, parameters),
         errors,
         case.noise,
-        0,
+        top.steps,
         problem.samples,
         bounds,
         problem.priors,
+        converged=top.converged,
+        left=2 * top.left,
     )
     # with hundreds of recordings the starts' part fills the memory
     rough = dataclasses.replace(

@@ -2,8 +2,8 @@
 
     log p(z | D) = log p(D | z) + log p(z) + constant
 
-log p(D | z) is averaged over noise and remainder (noise.py). Gauss-Newton steps with Levenberg's damping find
-the maximum; with the weights E[1/V] their gradient is exact. Gradient and curvature are sums over recordings:
+log p(D | z) is averaged over noise and remainder (noise.py). Its maximum is climbed by plant/climb.py; with
+the weights E[1/V] the gradient is exact. Gradient and curvature are sums over recordings:
 one recording at a time is simulated, and its sums are added.
 """
 
@@ -20,15 +20,15 @@ from thermoctl.diagnose.catalogue import EffectParameter
 from thermoctl.diagnose.coordinates import Channel, transform
 from thermoctl.diagnose.noise import Averaged, averaged
 from thermoctl.plant import expression as ex
+from thermoctl.plant.climb import Climbed, Spot, climb
 from thermoctl.plant.language import Plant
-from thermoctl.plant.residuals import HUGE, Problem
+from thermoctl.plant.residuals import HUGE, PROBE, Problem
 from thermoctl.plant.simulate import SimulationError, compile_plant
 
 BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
-ROUNDS = 15  # largest number of Gauss-Newton steps
-DAMPINGS = 0.0, 0.1, 1.0, 10.0, 100.0  # shares of the curvature added to it, tried in this order
+ROUNDS = 40  # largest number of steps
 FAR = 8.0  # standard deviations that a start may be off
-ENOUGH = 0.05  # gain in the log posterior, below which no further step is taken
+ENOUGH = 0.05  # of the log posterior, promised by a step, below which none is taken
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,21 @@ class Hypothesis:
     def keys(self) -> frozenset[tuple[str, str]]:
         """The (effect, where) of each."""
         return frozenset(e.key for e in self.effects)
+
+
+# z, and each recording's unknowns and its channels' slopes (rows, k) there
+Slopes = tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a look at a point gave: free-run errors, their rows, likelihood, powers; slopes where they are kept."""
+
+    errors: list[np.ndarray]
+    rows: list[np.ndarray]
+    average: Averaged
+    powers: list[np.ndarray]
+    slopes: Slopes | None
 
 
 @dataclass(frozen=True)
@@ -142,8 +157,7 @@ class Posterior:
         self.believed = np.setdiff1d(np.flatnonzero(stated.any(axis=0)), self.shared)
         coordinates = case.coordinates
         self.channels = [coordinates.of_recording(r) for r in range(len(self.drives))]
-        # z, and each recording's unknowns and its channels' slopes (rows, k) there
-        self.kept: tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]] | None = None
+        self.kept: Slopes | None = None
         self.newest: tuple[np.ndarray, Sequence[Sums]] | None = None
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -164,6 +178,7 @@ class Posterior:
             raise SimulationError("the simulation gives values that are not numbers")
         return errors
 
+    @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Between which the unknowns lie."""
         n, m = self.problem.n_parameters, len(self.problem.unknowns)
@@ -242,66 +257,44 @@ class Posterior:
             out += pull.T @ unsure @ pull
         return out
 
-    def climb(
-        self, z: np.ndarray, goal: float
-    ) -> tuple[np.ndarray, Averaged, list[np.ndarray], np.ndarray, list[np.ndarray]]:
-        """Return z, likelihood, powers, H and errors at the maximum near z.
+    @property
+    def few(self) -> bool:
+        """Should a trial step compute slopes at once?"""
+        return self.problem.few
 
-        Stop early if `goal` is out of reach."""
-        low, high = self.bounds()
-        errors = self.errors_and_slopes(z)
+    def look(self, z: np.ndarray, slopes: bool) -> Spot[Seen]:
+        """The log posterior at z."""
+        kept = self.kept
+        errors = self.errors_and_slopes(z) if slopes else self.errors(z)
+        slopes_here, self.kept = self.kept if slopes else None, kept
         rows = self.rows(errors)
-        now, powers = self.likelihood(rows)
-        gradient, matrix = self.slope(z, rows, now.inverse)
-        first = 0
-        for left in range(ROUNDS, 0, -1):
-            base = now.log_likelihood + self.prior(z)
-            gained, here = 0.0, self.kept
-            for k in range(first, len(DAMPINGS)):
-                damped = matrix + DAMPINGS[k] * np.diag(np.diag(matrix))
-                trial = np.clip(z + bounded_step(z, gradient, damped, low, high), low, high)
-                try:
-                    at_once = self.problem.few and k == first
-                    e = self.errors_and_slopes(trial) if at_once else self.errors(trial)
-                except SimulationError:
-                    continue
-                trial_rows = self.rows(e)
-                then, trial_powers = self.likelihood(trial_rows)
-                gained = then.log_likelihood + self.prior(trial) - base
-                if gained > 0:
-                    z, errors, rows, now, powers = trial, e, trial_rows, then, trial_powers
-                    gradient, matrix = self.slope(z, rows, now.inverse)
-                    first = max(k - 1, 0)
-                    break
-                self.kept = here
-            if gained < ENOUGH or now.log_likelihood + left * gained < goal:
-                break
-        return z, now, powers, matrix, errors
-
-
-def bounded_step(
-    z: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Return Newton's step inside the bounds; a coordinate that reaches its bound stays there."""
-    free = ~(((z <= low) & (gradient < 0)) | ((z >= high) & (gradient > 0)))
-    step = np.zeros_like(z)
-    for _ in range(len(z)):
-        index = np.flatnonzero(free)
-        if not len(index):
-            break
-        rest = np.flatnonzero(~free)
-        right = gradient[index] - matrix[np.ix_(index, rest)] @ step[rest]
-        step[index] = np.linalg.solve(
-            matrix[np.ix_(index, index)] + 1e-9 * np.diag(np.diag(matrix)[index]), right
+        average, powers = self.likelihood(rows)
+        return Spot(
+            z, average.log_likelihood + self.prior(z), Seen(errors, rows, average, powers, slopes_here)
         )
-        out = index[
-            (z[index] + step[index] < low[index] - 1e-12) | (z[index] + step[index] > high[index] + 1e-12)
-        ]
-        if not len(out):
-            break
-        step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
-        free[out] = False
-    return step
+
+    def stand(self, spot: Spot[Seen]) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradient and minus the second derivative of the log posterior."""
+        self.kept = spot.found.slopes
+        return self.slope(spot.z, spot.found.rows, spot.found.average.inverse)
+
+    def bend(self, spot: Spot[Seen], step: np.ndarray) -> np.ndarray:
+        """Weighed by E[1/V] of the spot. Zeros where the recordings are too many to keep their slopes."""
+        out = np.zeros_like(step)
+        if self.kept is None:
+            return out
+        moved = self.rows(self.errors(spot.z + PROBE * step))
+        channels, seen, at = self.case.coordinates.channels, spot.found, 0
+        for unknowns, slopes in self.kept[1]:
+            for jac in slopes:
+                second = (moved[at] - seen.rows[at]) / PROBE + jac @ step[unknowns]
+                np.add.at(out, unknowns, jac.T @ (seen.average.inverse[at][channels[at].band] * second))
+                at += 1
+        return out * (2 / PROBE)
+
+    def climb(self, z: np.ndarray, goal: float) -> Climbed[Seen]:
+        """Return the maximum near z. Stop early if `goal`, a log likelihood, is out of reach."""
+        return climb(self, z, ROUNDS, lambda height: ENOUGH, goal)
 
 
 def _priors(

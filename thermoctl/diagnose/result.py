@@ -121,6 +121,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "before": _as_it_came(d),
                 "refit_only": d.null.fit.rms(),
                 "after": d.final.fit.rms(),
+                "converged": d.null.fit.converged and d.final.fit.converged,
                 "held_out_before": d.worth.before,
                 "held_out_refit_only": d.worth.refit_only,
                 "held_out_after": d.worth.after if d.shown else d.worth.refit_only,
@@ -148,6 +149,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
+        *unfinished(d.null, d.final),
         *filter(None, [d.unknown]),
         *(
             f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
@@ -155,6 +157,20 @@ def _notes(d: Diagnosis) -> list[str]:
             for effect, where in unnamed
         ),
         *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
+    ]
+
+
+def unfinished(*fits: Fitted) -> list[str]:
+    """Return a sentence for each hypothesis whose refit ended by its limit, below its maximum."""
+    names = {
+        ", ".join(f"{e} at {at}" for e, at in sorted(f.hypothesis.keys)) or "the plant without effects": f.fit
+        for f in fits
+        if not f.fit.converged
+    }
+    return [
+        f"the refit of {name} ended after {fit.iterations} steps below its maximum; another promised {0.5 * fit.left:.2g} nats: "
+        "its probability may be too small"
+        for name, fit in names.items()
     ]
 
 
@@ -308,6 +324,7 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "rms": w.fitted.fit.rms(),
                 "cost": w.fitted.rough.cost,
                 "at_bound": w.fitted.fit.at_bound,
+                "converged": w.fitted.fit.converged,
                 "energy": list(d.energy[keys].squares),
                 "misfit": list(d.energy[keys].misfit),
                 "rows": list(d.energy[keys].rows),

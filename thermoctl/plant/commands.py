@@ -18,7 +18,7 @@ from thermoctl.plant import show as drawing
 from thermoctl.plant.estimate import Estimate, report, updated
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.recordings import as_recorded, read_recordings
-from thermoctl.plant.refit import fit
+from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.logger import parsed_columns
@@ -243,6 +243,7 @@ def refit(args: argparse.Namespace) -> int:
                 f"refitted by thermoctl to {', '.join(Path(r).name for r in args.recordings)}",
             )
         Console().print(_estimates(plant, report(found, excitations)))
+        Console().print(_ended(found), end="")
         grid = Grid(title="rms error", title_justify="left")
         for head in ("recording", "took part", "output", "before", "after"):
             grid.add_column(head, justify="right" if head in ("before", "after") else "left")
@@ -255,6 +256,13 @@ def refit(args: argparse.Namespace) -> int:
     except SimulationError as e:
         raise InputError(f"{plant.file}: {e}") from None
     return 0
+
+
+def _ended(found: Fit) -> str:
+    """Return a line about a refit that its limit ended; nothing about any other."""
+    if found.converged:
+        return ""
+    return f"the refit ended by its limit of steps or time: its cost, {found.cost:.4g}, may fall by {found.left:.2g} more\n"
 
 
 def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:

@@ -1,13 +1,6 @@
 """Refit of a plant's own parameters to recordings: bounded, weighted least squares on the free-run error.
 
-The cost is in residuals.py. Each step is Gauss-Newton with Levenberg's damping on the normal equations, plus
-half the geodesic acceleration (Transtrum & Sethna 2012, arXiv:1201.5885):
-
-    (J'J + l D) v = J' r,    (J'J + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2
-    r = (measured - simulated) / s,    J = -dr/dz
-
-A parameter that meets its bound is held there until the gradient leads back inside. Sensitivities are exact
-(compile.py).
+The cost is in residuals.py, its steps are in climb.py. Sensitivities are exact (compile.py).
 """
 
 from __future__ import annotations
@@ -19,14 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from thermoctl.plant.climb import Climbed, Spot, climb
 from thermoctl.plant.residuals import Evaluation, Prior, Problem, Rows
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.plant.whitening import Noise, default_noise
 
-STEPS_TO_GOAL = 20.0  # a step is slow if the `goal` is more than this many such steps away
-SLOW_STEPS = 3  # give up after so many slow steps in a row
 AT_BOUND = 1e-6  # a parameter counts as at its bound within this share of its range
-MAX_ACCELERATION = 0.75  # use the geodesic acceleration only up to this share of the step
 MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations
 KEPT_STARTS = 2  # number of random starts that are refined
 PREVIEW = (
@@ -45,7 +36,9 @@ class Fit:
     - `z`: their scaled values: a parameter's is 0..1 in its range, an initial state's in standard deviations
     - `hessian`: Gauss-Newton matrix, the inverse covariance of `z`; `prior_hessian`: the priors' share
     - `residuals`: (N, outputs) by recording, NaN where missing
-    - `sizes`: rms of each output's residuals, where these were not kept"""
+    - `sizes`: rms of each output's residuals, where these were not kept
+    - `converged`: False where a limit of steps or time ended the refit; `left`: the fall of the cost that
+      another step promised"""
 
     model: Model
     values: np.ndarray
@@ -62,6 +55,8 @@ class Fit:
     priors: tuple[Prior, ...] = ()
     prior_hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     sizes: dict[str, float] = field(default_factory=dict)
+    converged: bool = True
+    left: float = 0.0
 
     def parameters(self, recording: int = 0) -> dict[str, float]:
         """Return all parameter values of one recording."""
@@ -111,9 +106,8 @@ def fit(
     """Fit the active parameters that have a range, and the uncertain initial states, to the recordings.
 
     `tries`: random starts over the ranges besides `start`; the best KEPT_STARTS are followed. `seconds`: no
-    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is more than
-    STEPS_TO_GOAL steps away. Raises SimulationError if no start can be simulated, InputError if there is
-    nothing to compare."""
+    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is out of reach. Raises
+    SimulationError if no start can be simulated, InputError if there is nothing to compare."""
     for d in excitations:
         if d.scale is None:
             model.prepare(d)
@@ -179,118 +173,54 @@ def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
     )
 
 
-def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
-    """Do Gauss-Newton steps with Levenberg's damping inside the bounds, from z until `limits` are reached."""
-    n_states = len(z) - problem.n_parameters
-    low = np.concatenate([np.zeros(problem.n_parameters), np.full(n_states, -MAX_SHIFT)])
-    high = np.concatenate([np.ones(problem.n_parameters), np.full(n_states, MAX_SHIFT)])
-    z = np.clip(z, low, high)
-    kept: list[Rows] = []
-    now = problem.evaluate(z, True, kept)
-    problem.keep()
-    damping, done, out_of_reach = 1e-3, 0, 0
-    for done in range(1, limits.iterations + 1):  # noqa: B007 the count is reported
-        held = ((z <= low) & (now.gradient < 0)) | ((z >= high) & (now.gradient > 0))
-        free = np.flatnonzero(~held)
-        if not len(free) or time.thread_time() > limits.deadline:
-            break
-        better = _improve(problem, z, now, free, damping, (low, high), kept, limits.tolerance)
-        if better is None:
-            break
-        z, then, damping, kept = better
-        gain, now = now.cost - then.cost, then
-        out_of_reach = out_of_reach + 1 if STEPS_TO_GOAL * gain < now.cost - limits.goal else 0
-        if gain < limits.tolerance * max(1.0, 1e-3 * now.cost) or out_of_reach >= SLOW_STEPS:
-            break
-    return _result(problem, z, now, done)
+Found = tuple[Evaluation, list[Rows] | None]  # rows only where slopes were computed
 
 
-def _improve(
-    problem: Problem,
-    z: np.ndarray,
-    now: Evaluation,
-    free: np.ndarray,
-    damping: float,
-    bounds: tuple[np.ndarray, np.ndarray],
-    kept: Sequence[Rows],
-    tolerance: float,
-) -> tuple[np.ndarray, Evaluation, float, list[Rows]] | None:
-    """Return a point of less cost, its evaluation with derivatives, the next damping, and its rows.
+class _Misfit:
+    """Minus half the cost of a problem, as a height to climb."""
 
-    None if no damping up to the twelfth gives one."""
-    for tries in range(12):
-        step, left = _bounded_step(z, now, free, damping, bounds)
-        predicted = float(2 * now.gradient @ step - step @ now.matrix @ step)
+    def __init__(self, problem: Problem):
+        self.problem, self.few = problem, problem.few
+        n, states = problem.n_parameters, len(problem.unknowns) - problem.n_parameters
+        shift = np.full(states, MAX_SHIFT)
+        self.bounds = np.append(np.zeros(n), -shift), np.append(np.ones(n), shift)
+        self.rows: list[Rows] = []  # where the climb stands
+
+    def look(self, z: np.ndarray, slopes: bool) -> Spot[Found]:
+        """Evaluate the cost."""
         rows: list[Rows] = []
-        try:
-            bend = _acceleration(problem, z, step, now.matrix, damping, left, kept)
-            trial = np.clip(z + step + bend, *bounds)
-            at_once = problem.few and not tries
-            then = problem.evaluate(trial, at_once, rows)
-        except SimulationError:
-            damping = min(damping * 8, 1e8)
-            continue
-        if then.cost < now.cost:
-            if not at_once:
-                then = problem.evaluate(trial, True, rows)
-            problem.keep()
-            half = now.cost - then.cost > 0.5 * predicted
-            return trial, then, max(damping * (0.2 if half else 1.0), 1e-9), rows
-        if predicted < 1e-3 * tolerance * max(now.cost, 1.0):
-            return None
-        damping = min(damping * 8, 1e8)
-    return None
+        found = self.problem.evaluate(z, slopes, rows)
+        return Spot(z, -0.5 * found.cost, (found, rows if slopes else None))
 
+    def stand(self, spot: Spot[Found]) -> tuple[np.ndarray, np.ndarray]:
+        """Return half the cost's negative gradient, and the Gauss-Newton matrix."""
+        found, rows = spot.found
+        if rows is None:
+            found, rows = self.look(spot.z, True).found
+        self.rows = rows or []
+        self.problem.keep()
+        return found.gradient, found.matrix
 
-def _bounded_step(
-    z: np.ndarray, now: Evaluation, free: np.ndarray, damping: float, bounds: tuple[np.ndarray, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the damped Gauss-Newton step within the bounds, and the unknowns that stay inside."""
-    low, high = bounds
-    step, left = np.zeros_like(z), free
-    for _ in range(
-        len(free) + 1
-    ):  # an unknown whose step crosses its bound stops there; solve for the others again
-        sub = now.matrix[np.ix_(left, left)]
-        fixed = np.setdiff1d(free, left)
-        rhs = now.gradient[left] - now.matrix[np.ix_(left, fixed)] @ step[fixed]
-        step[left] = np.linalg.solve(sub + damping * np.diag(np.diag(sub)), rhs)
-        out = left[(z[left] + step[left] < low[left] - 1e-12) | (z[left] + step[left] > high[left] + 1e-12)]
-        if not len(out):
-            break
-        step[out] = np.clip(z[out] + step[out], low[out], high[out]) - z[out]
-        left = np.setdiff1d(left, out)
-        if not len(left):
-            break
-    return step, left
-
-
-def _acceleration(
-    problem: Problem,
-    z: np.ndarray,
-    step: np.ndarray,
-    matrix: np.ndarray,
-    damping: float,
-    free: np.ndarray,
-    kept: Sequence[Rows],
-) -> np.ndarray:
-    """Return half the geodesic acceleration, or zeros if it is not small beside the step.
-
-    The cost's valleys are curved, and a straight step leaves them (Transtrum & Sethna 2012, arXiv:1201.5885).
-    It needs the sensitivities of all recordings: zeros where they are too many to be kept.
-    """
-    out = np.zeros_like(step)
-    if len(free) and problem.keeps:
-        sub = matrix[np.ix_(free, free)]
-        weight = np.diag(sub)
-        curvature = problem.curvature(z, step, kept)[free]
-        out[free] = 0.5 * np.linalg.solve(sub + damping * np.diag(weight), curvature)
-        if not weight @ out[free] ** 2 <= (0.5 * MAX_ACCELERATION) ** 2 * (weight @ step[free] ** 2):
+    def bend(self, spot: Spot[Found], step: np.ndarray) -> np.ndarray:
+        """Return zeros where the sensitivities of all recordings are too many to be kept."""
+        if not self.problem.keeps:
             return np.zeros_like(step)
-    return out
+        return self.problem.curvature(spot.z, step, self.rows)
 
 
-def _result(problem: Problem, z: np.ndarray, now: Evaluation, iterations: int) -> Fit:
+def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
+    """Descend inside the bounds from z, until `limits` are reached."""
+
+    def enough(height: float) -> float:
+        """Return half of the tolerance at a height."""
+        return 0.5 * limits.tolerance * max(1.0, -2e-3 * height)
+
+    top = climb(_Misfit(problem), z, limits.iterations, enough, -0.5 * limits.goal, limits.deadline)
+    return _result(problem, top)
+
+
+def _result(problem: Problem, top: Climbed[Found]) -> Fit:
+    z, now = top.spot.z, top.spot.found[0]
     values, dx0 = problem.unpack(z)
     at_bound = {}
     for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
@@ -305,14 +235,16 @@ def _result(problem: Problem, z: np.ndarray, now: Evaluation, iterations: int) -
         now.cost,
         problem.unknowns,
         z,
-        now.matrix,
+        top.matrix,
         now.residuals,
         problem.noise,
-        iterations,
+        top.steps,
         problem.samples,
         at_bound,
         problem.priors,
         problem.prior_terms(values, True)[2],
+        converged=top.converged,
+        left=2 * top.left,
     )
 
 
