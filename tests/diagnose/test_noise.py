@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.fft import dct
@@ -11,10 +13,12 @@ from scipy.special import logsumexp
 
 from thermoctl.diagnose import noise as module
 from thermoctl.diagnose.coordinates import Coordinates, transform
+from thermoctl.diagnose.densities import NOISE, REMAINDER
+from thermoctl.diagnose.densities import SLOW as SLOW_NOISE
 from thermoctl.diagnose.grids import Grid, grid
 from thermoctl.diagnose.levels import floor
 from thermoctl.diagnose.noise import Around, Averaged, averaged
-from thermoctl.diagnose.spectra import SLOW
+from thermoctl.diagnose.spectra import SLOW, slow_parts
 from thermoctl.plant.simulate import Excitation
 
 ROWS, SIGMA, SWING = 2000, 0.05, 5.0
@@ -109,30 +113,56 @@ def test_slow_noise_is_averaged_over_its_size_time_and_flicker(phi):
     )
     log_p = log_p - 0.5 * (level / g.known) ** 2 - np.log(np.sqrt(2 * np.pi) * g.known)
     whole = logsumexp(log_p) + np.log(0.01 / 30**3)
-    assert module._laplace(module._Noise(g, power, True)).log_p == pytest.approx(whole, abs=0.5)
+    found = module.log_p(g, SLOW_NOISE, *module.density(g, SLOW_NOISE).top(power))
+    assert found == pytest.approx(whole, abs=0.5)
 
 
-@pytest.mark.parametrize("kind", ["noise", "slow noise", "remainder"])
+@pytest.mark.parametrize("kind", [NOISE, SLOW_NOISE, REMAINDER])
 @pytest.mark.parametrize("change", [0.0, 20 * SIGMA])
 def test_slopes_and_curvatures_of_the_log_densities_are_those_of_differences(kind, change):
     (g,), powers = banded(coloured(5, 0.7, 3.0), change=change)
     power = np.bincount(g.node, powers[0])
-    first = 1 + (change > 0)
-    assert len(g.scales) == first
-    if kind == "remainder":
-        precision = np.diag(np.r_[g.scales**-2.0, np.zeros(len(g.count))])
-        precision[first:, first:] = g.rough
-        density = module._Remainder(g, power, precision)
-    else:
-        density = module._Noise(g, power, kind == "slow noise")
-    x = density.start() + 0.3 * np.random.default_rng(1).standard_normal(len(density.start()))
-    at, step = density.at(x), 1e-5 * np.eye(len(x))
-    slope = [(density.at(x - d).log_density - density.at(x + d).log_density) / 2e-5 for d in step]
-    curvature = [(density.at(x + d).uphill - density.at(x - d).uphill) / 2e-5 for d in step]
-    ratio = [(np.log(density.at(x + d).variance) - np.log(density.at(x - d).variance)) / 2e-5 for d in step]
+    assert len(g.scales) == 1 + (change > 0)
+    density = module.density(g, kind)
+    x = density.start(power)
+    x += 0.3 * np.random.default_rng(1).standard_normal(len(x))
+    at, step = density.at(x, power), 1e-5 * np.eye(len(x))
+    ends = [(density.at(x + d, power), density.at(x - d, power)) for d in step]
+    slope = [(low.log_density - high.log_density) / 2e-5 for high, low in ends]
+    curvature = [(high.uphill - low.uphill) / 2e-5 for high, low in ends]
+    ratio = [(np.log(high.variance) - np.log(low.variance)) / 2e-5 for high, low in ends]
     np.testing.assert_allclose(at.uphill, slope, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(at.curvature, curvature, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(at.slope, np.transpose(ratio), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("change", [0.0, 20 * SIGMA])
+def test_the_densities_are_the_equations_of_the_docstring(change):
+    """V, likelihood and prior of each, written out in numpy beside the compiled ones."""
+    (g,), powers = banded(coloured(5, 0.7, 3.0), change=change)
+    power, n, late = np.bincount(g.node, powers[0]), g.count, len(g.scales) - 1
+    rng = np.random.default_rng(4)
+    for kind, size in ((NOISE, 0), (SLOW_NOISE, 3), (REMAINDER, len(n))):
+        x = 0.5 * rng.standard_normal(1 + late + size)
+        head, rest = x[: 1 + late], x[1 + late :]
+        shape = slow_parts(g.turn, rest) if kind == SLOW_NOISE else g.shape
+        v = g.variance * np.exp(x[0]) * shape * n.sum() / (shape @ n)
+        v = v + (g.variance * g.clock * np.exp(x[1]) if late else 0.0)
+        prior = head @ (head / g.scales**2) + (rest @ rest if kind == SLOW_NOISE else 0.0)
+        if kind == REMAINDER:
+            mean = n @ np.exp(rest) / n.sum()
+            v = v + g.small * (np.exp(rest) + module.FLOOR * mean)
+            prior += rest @ g.rough @ rest + mean
+        at = module.density(g, kind).at(x, power)
+        np.testing.assert_allclose(at.variance, v, rtol=1e-12)
+        assert at.log_density == pytest.approx(-0.5 * (n @ np.log(v) + (power / v).sum() + prior), rel=1e-12)
+
+
+def test_a_density_is_the_same_in_another_process():
+    (g,), powers = banded(coloured(5, 0.7))
+    density, power = module.density(g, REMAINDER), np.bincount(g.node, powers[0])
+    again = pickle.loads(pickle.dumps(density))
+    np.testing.assert_array_equal(again.top(power)[0].x, density.top(power)[0].x)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.02])
@@ -181,7 +211,7 @@ def test_slow_errors_far_louder_than_the_stated_noise_are_a_remainder():
 
 def test_a_residual_of_zero_has_a_finite_likelihood():
     """A simulated recording without noise, or a sensor that stands still."""
-    found = likelihood(np.zeros(ROWS))
+    found = averaged(*banded(np.zeros(ROWS)), unsure=True)
     assert np.isfinite(found.log_likelihood)
     assert all(np.isfinite(v).all() for v in (*found.inverse, *found.unsure))
 

@@ -119,7 +119,7 @@ def grid(
     interval = channels[0].interval
     turn = 2 * np.pi * frequency * interval / block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
-    slow = np.array([slow_parts(turn, x)[0] for x in STARTS])
+    slow = np.array([slow_parts(turn, x) for x in STARTS])
     return Grid(
         tuple(positions),
         node,

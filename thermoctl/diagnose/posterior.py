@@ -247,7 +247,8 @@ class Posterior:
             self.slope(z, rows, average.inverse)
         assert self.newest is not None
         by_band = [(s.unknowns, x) for s in self.newest[1] for x in s.by_band]
-        for g, unsure in zip(self.case.grids, average.unsure, strict=True):
+        powers = self.case.coordinates.powers(rows)
+        for g, unsure in zip(self.case.grids, averaged(self.case.grids, powers, True).unsure, strict=True):
             pull = np.zeros((len(unsure), len(z)))
             at = 0
             for k in g.channels:

@@ -45,25 +45,9 @@ def flicker_part(turn: np.ndarray) -> np.ndarray:
     return np.pi / (np.log(10.0) * turn)
 
 
-def slow_parts(turn: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the spectrum (nodes,) of a noise whose white part is 1, and its two derivatives by x.
+def slow_parts(turn: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the spectrum (nodes,) of a noise whose white part is 1 (densities.pyx has its derivatives).
 
-    x: standard normal values, as probable as the first-order part's size and time, and the other's size.
-    The derivatives are (3, nodes) and (3, 3, nodes)."""
-    apart = SLOW[:, 1] - SLOW[:, 0]
-    size, time, flicker = np.exp(SLOW[:, 0] + apart * ndtr(x))
-    steps = apart * np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)  # d log of each by x
-    first, other = size**2 * first_order(time, turn), flicker**2 * flicker_part(turn)
-    phi = np.exp(-1 / time)
-    below = 1 - 2 * phi * np.cos(turn) + phi**2
-    near, far = (np.cos(turn) - phi) / below, phi / (1 - phi**2)
-    by_time = 2 * phi / time * (near - far)  # d log first / d log time
-    bend = (1 / time - 1) * by_time
-    bend += 2 * (phi / time) ** 2 * (2 * near**2 - 1 / below - (1 + phi**2) / (1 - phi**2) ** 2)
-    change = np.array([2 * first * steps[0], by_time * first * steps[1], 2 * other * steps[2]])
-    second = np.zeros((3, 3, len(turn)))
-    second[0, 0] = change[0] * (2 * steps[0] - x[0])
-    second[0, 1] = second[1, 0] = change[1] * 2 * steps[0]
-    second[1, 1] = change[1] * (by_time * steps[1] - x[1]) + first * bend * steps[1] ** 2
-    second[2, 2] = change[2] * (2 * steps[2] - x[2])
-    return 1 + first + other, change, second
+    x: standard normal values, as probable as the first-order part's size and time, and the other's size."""
+    size, time, flicker = np.exp(SLOW[:, 0] + (SLOW[:, 1] - SLOW[:, 0]) * ndtr(x))
+    return np.asarray(1 + size**2 * first_order(time, turn) + flicker**2 * flicker_part(turn))
