@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
@@ -90,7 +90,7 @@ def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
         for part in np.array_split(np.arange(len(a)), BLOCKS)
     ]
     mean, spread = float(np.mean(blocks)), float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks))
-    return float(student.cdf(mean / spread, len(blocks) - 1)) if spread > 0 else float(mean > 0)
+    return float(stdtr(len(blocks) - 1, mean / spread)) if spread > 0 else float(mean > 0)
 
 
 def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:

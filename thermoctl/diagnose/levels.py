@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from thermoctl.diagnose.case import Case
 from thermoctl.diagnose.fit import Fitted
@@ -25,7 +25,7 @@ def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
     octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
     rows = np.bincount(octave, g.count) - absorbed
     told = rows > 0
-    allowed = np.bincount(octave, power)[told] / chi2.ppf(RARE, rows[told])
+    allowed = np.bincount(octave, power)[told] / chdtri(rows[told], 1 - RARE)
     return float(min(allowed.min(initial=g.most), g.most))
 
 

@@ -47,6 +47,7 @@ _COMMON = {
     "K": "K",
     "degC": "K",
     "delta_degC": "K",
+    "degF": "K",
     "mK": "K",
     "Hz": "s-1",
     "kHz": "s-1",
@@ -73,6 +74,11 @@ _COMMON = {
     "T": "kg s-2 A-1",
     "Wb": "kg m2 s-2 A-1",
 }
+_KELVIN = {
+    "K": (1.0, 0.0),
+    "degC": (1.0, 273.15),
+    "degF": (5 / 9, 459.67 * 5 / 9),
+}  # scale, offset to kelvins
 _BASES = {
     "[length]": "m",
     "[mass]": "kg",
@@ -321,6 +327,9 @@ def conversion(given: str, wanted: str) -> tuple[float, float]:
         raise ValueError(f"{given} [{_text(dimension(given))}] is no {wanted} [{_text(dimension(wanted))}]")
     if given == wanted:
         return 1.0, 0.0
+    if given in _KELVIN and wanted in _KELVIN:
+        (a, b), (c, d) = _KELVIN[given], _KELVIN[wanted]
+        return a / c, (b - d) / c
     registry = _registry()
     ends = [float(registry.Quantity(x, _spelled(given)).to(_spelled(wanted)).magnitude) for x in (0.0, 1.0)]
     return ends[1] - ends[0], ends[0]

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import lfilter
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
@@ -99,6 +98,8 @@ class Whitening:
         part = e if len(self.index) == len(e) else e[self.index]
         shape = (-1, *([1] * (part.ndim - 1)))
         if len(self.noise.ar) > 1 and len(self.index) > 1:
+            from scipy.signal import lfilter  # its import takes longer than most plants' simulation
+
             return lfilter(self.noise.ar, self.noise.ma, part, axis=0) / self.noise.sigma
         if len(self.index) > 1 and self.phi.any():
             part = np.concatenate([part[:1], part[1:] - self.phi.reshape(shape) * part[:-1]])
