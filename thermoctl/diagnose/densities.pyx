@@ -1,14 +1,14 @@
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False, language_level=3
-"""Log densities of an output's residual in its frequencies, integrated by Laplace's method (equations in noise.py).
+"""Log densities of an output's residual in its frequencies, integrated by Laplace's method (noise.py).
 
 Three densities of x and the powers P (nodes,):
 
     noise        x: log c^2 and, where it may be seen, log j^2 over its median
-    slow noise   x: these, then standard normal values as probable as the slow parts' sizes and time (spectra.py)
+    slow noise   x: these, then standard normal values as probable as the slow parts' sizes and time
     remainder    x: these, then u
 
-Each has V, d log V / dx, and slope and exact curvature of minus the log density: the expected curvature (Fisher)
-misleads where a residual spans many decades. Newton's method with damping finds the maximum.
+Each has V, d log V / dx, and slope and exact curvature of minus the log density. The expected curvature
+(Fisher) misleads where a residual spans many decades. Newton's method with damping finds the maximum.
 """
 import numpy as np
 from libc.math cimport cos, erfc, exp, fabs, fmax, fmin, log, sqrt, INFINITY, M_PI
@@ -24,7 +24,9 @@ cdef int STEPS = 1000  # largest number of steps
 
 
 cdef class Spot:
-    """A log density at x (k,): V (nodes,), d log V / dx (nodes, k), and minus the log density's slope and curvature."""
+    """A log density at x (k,): V (nodes,), d log V / dx (nodes, k).
+
+    `uphill` (k,) and `curvature` (k, k) are of minus the log density."""
     cdef readonly double log_density
     cdef readonly object x, variance, slope, uphill, curvature
     cdef double[::1] _x, _variance, _uphill
@@ -40,11 +42,12 @@ cdef class Spot:
 cdef class Density:
     """One density of an output's residual.
 
-    - `kind`: NOISE, SLOW or REMAINDER; `count`, `shape` (nodes,), `variance`, `clock`, `small`, `scales`: of its Grid
-    - `turn` (nodes,), `slow` (3, 2): angles, and least and largest log size, time and size of the slow parts
-    - `diagonal` (nodes,), `beside` (nodes - 1,): of u's tridiagonal precision; `spread`: share of the remainder's energy
-      at all frequencies
-    - `starts` (n, 3), `spectra` (n, nodes): x of the slow parts and their spectra, of which the likeliest is the start"""
+    - `kind`: NOISE, SLOW or REMAINDER
+    - `count`, `shape`, `turn` (nodes,), `variance`, `clock`, `small`, `scales`: of its Grid
+    - `slow` (3, 2): least and largest log size, time and size of the slow parts
+    - `diagonal` (nodes,), `beside` (nodes - 1,): of u's tridiagonal precision
+    - `spread`: share of the remainder's energy at all frequencies
+    - `starts` (n, 3), `spectra` (n, nodes): x of the slow parts, and their spectra"""
     cdef readonly int kind
     cdef readonly Py_ssize_t size
     cdef Py_ssize_t nodes, first
@@ -152,7 +155,7 @@ cdef class Density:
         found.log_density = -0.5 * density
 
     cdef void _slow_parts(self, double[::1] x, double[:, ::1] part):
-        """Spectrum with slow parts, its mean over all rows 1, its slopes and second derivatives by x (spectra.py)."""
+        """Write the spectrum with slow parts, its mean over all rows 1, and its derivatives by x."""
         cdef Py_ssize_t n = self.nodes, i, a, b, at
         cdef double[3] value, step, y, drift
         cdef double[6] bend

@@ -62,7 +62,7 @@ Slopes = tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]]
 
 @dataclass(frozen=True)
 class Seen:
-    """What a look at a point gave: free-run errors, their rows, likelihood, powers; slopes where they are kept."""
+    """The free-run errors at a point, their rows, likelihood and powers; slopes where they are kept."""
 
     errors: list[np.ndarray]
     rows: list[np.ndarray]

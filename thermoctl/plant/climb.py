@@ -59,14 +59,14 @@ class Hill(Protocol[T]):
         """Return gradient (n,) and H (n, n) at a spot. Its slopes stay until the next call."""
 
     def bend(self, spot: Spot[T], step: np.ndarray) -> np.ndarray:
-        """Return J' d2r/dh2 (n,) along a step from the spot where the climb stands; zeros where it is not known."""
+        """Return J' d2r/dh2 (n,) along a step from the climb's spot; zeros where it is not known."""
 
 
 @dataclass(frozen=True)
 class Climbed(Generic[T]):
-    """The end of a climb: gradient and H there, the number of steps, and the height that a step still promised.
+    """The end of a climb, with gradient and H there, and the number of steps.
 
-    `converged`: not ended by a limit."""
+    `left`: the height that another step promised; `converged`: not ended by a limit."""
 
     spot: Spot[T]
     gradient: np.ndarray
@@ -86,7 +86,7 @@ def climb(
 ) -> Climbed[T]:
     """Climb from z until a step promises less than `enough` at that height.
 
-    `steps`: largest number; `goal`: a height that has to stay in reach; `deadline`: by this thread's clock, s.
+    `steps`: largest number; `goal`: a height to stay in reach; `deadline`: by this thread's clock, s.
     Raises SimulationError if the start cannot be simulated."""
     spot = hill.look(np.clip(z, *hill.bounds), True)
     gradient, matrix = hill.stand(spot)
@@ -148,10 +148,10 @@ def bounded_step(
     damping: float,
     bounds: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the step inside the bounds that promises most, and the indices of the unknowns that do not end at one.
+    """Return the step inside the bounds that promises most, and the indices of the unknowns not held at one.
 
-    The active set of a quadratic program: from one point to the next the promise rises. An unknown that meets
-    its bound is held there; it is let go where the slope leads back inside."""
+    It solves a quadratic program by its active set: from one point to the next the promise rises. An unknown
+    that meets its bound is held there; it is let go where the slope leads back inside."""
     low, high = bounds[0] - z, bounds[1] - z
     h = matrix + max(damping, LEAST) * np.diag(np.diag(matrix))
     step = np.zeros_like(z)
@@ -181,7 +181,7 @@ def bounded_step(
 def _bend(
     hill: Hill[T], spot: Spot[T], step: np.ndarray, matrix: np.ndarray, damping: float, free: np.ndarray
 ) -> np.ndarray:
-    """Return half the acceleration of the unknowns that do not end at a bound; zeros if it is not small beside the step."""
+    """Return half the acceleration of the unknowns `free`; zeros if it is not small beside the step."""
     out = np.zeros_like(step)
     if len(free):
         part = matrix[np.ix_(free, free)]

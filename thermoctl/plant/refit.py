@@ -106,8 +106,8 @@ def fit(
     """Fit the active parameters that have a range, and the uncertain initial states, to the recordings.
 
     `tries`: random starts over the ranges besides `start`; the best KEPT_STARTS are followed. `seconds`: no
-    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is out of reach. Raises
-    SimulationError if no start can be simulated, InputError if there is nothing to compare."""
+    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is out of reach.
+    Raises SimulationError if no start can be simulated, InputError if there is nothing to compare."""
     for d in excitations:
         if d.scale is None:
             model.prepare(d)
