@@ -199,6 +199,11 @@ prove-laws: develop                # concealed laws that the catalogue lacks: 10
 laws-recordings: develop           # laws of real rigs beside the published form; RECORDINGS= the folder of rigs
 	$(BIN)/python -m tests.laws.real $(RECORDINGS)
 
+.PHONY: same-cases
+same-cases: develop                # cases of every family by the compiled loops and by those in Python: the same bytes; NUMBER=30: hours
+	$(BIN)/python -m pytest -m "slow or not slow" tests/concealed/test_loops.py
+	$(BIN)/python -m tests.concealed.same_cases --number $(if $(filter file,$(origin NUMBER)),30,$(NUMBER))
+
 .PHONY: demo-concealed
 demo-concealed: develop            # seven hidden effects on independently simulated rigs: diagnosed, modelled, compensated
 	$(BIN)/python -m tests.concealed.demo

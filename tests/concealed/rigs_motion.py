@@ -4,6 +4,7 @@ One substep h: half a step of position, a whole step of velocity with the smooth
 the linear damper), the Coulomb force as a set-valued law (the velocity is held at zero when the dry friction can hold
 it, else the exact impulse is taken off, never through zero), half a step of position. Memory forces (Bouc-Wen, Maxwell)
 take exact or midpoint steps. Four substeps a sample or more; many variants (rows) go through together as columns of numbers.
+The loop over samples and substeps is compiled (loops.pyx); march_in_python is the same.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tests.concealed.compiled import loops
 from tests.concealed.rig import Scene, Suspect, clock, levels, room
 from tests.concealed.rigs_thermal import _draw, _fault, _parameter_block, sensor_suspects
 from tests.concealed.thermal import Variant
@@ -63,51 +65,65 @@ def columns(rows: list[Variant]) -> dict[str, np.ndarray]:
     return out
 
 
-def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarray]:
+_DRY = (
+    "coulomb_friction.F",
+    "stribeck_friction.FC",
+    "stribeck_friction.FS",
+    "directional_friction.FP",
+    "directional_friction.FM",
+    "?sticky_zone.F",
+)
+States = dict[str, np.ndarray]
+
+
+def simulate(theta: dict, run: dict, rows: list[Variant]) -> States:
     """Position m, velocity m/s, coil temperature degC, each (m, N). `theta`: gain N/V or N/A, mass, damping, stiffness,
     and for a heated coil R, C_coil, G_coil."""
-    m, t, u = len(rows), run["t"], run["drive"]
     full = [{**theta, **row.theta} for row in rows]
-
-    def par(name: str, default: float = 0.0) -> np.ndarray:
-        return np.array([p.get(name, default) for p in full])
-
-    gain, mass, damping, stiffness = par("gain"), par("mass"), par("damping"), par("stiffness")
-    ohm, heat_c, heat_g = par("R"), par("C_coil", 1.0), par("G_coil")
-    e = columns(rows)
-    copper = np.array(
+    defaults = dict.fromkeys(("gain", "mass", "damping", "stiffness", "R", "G_coil"), 0.0) | {"C_coil": 1.0}
+    p = {name: np.array([float(x.get(name, v)) for x in full]) for name, v in defaults.items()}
+    p["copper"] = np.array(
         [
-            any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0)
+            float(any(x == "copper_resistance" for x, _, _ in row.effects) or theta.get("knows_copper", 0))
             for row in rows
         ]
     )
-    on = {k: bool(np.any(v != _NEUTRAL[k])) for k, v in e.items()}
-    dry = any(
-        on[k]
-        for k in (
-            "coulomb_friction.F",
-            "stribeck_friction.FC",
-            "stribeck_friction.FS",
-            "directional_friction.FP",
-            "directional_friction.FM",
-            "?sticky_zone.F",
-        )
-    )
-    x = np.array([row.start.get("position", 0.0) for row in rows]) + run.get("start", 0.0)
-    v = np.zeros(m)
-    air = run["air"]
-    coil = (
-        np.full(m, air[0])
+    p["start"] = np.array([row.start.get("position", 0.0) for row in rows]) + run.get("start", 0.0)
+    p["start_coil"] = (
+        np.full(len(rows), run["air"][0])
         + np.array([row.start.get("coil", 0.0) for row in rows])
         + run.get("start_coil", 0.0)
     )
+    whole = {
+        **run,
+        "substeps": run.get("substeps", SUBSTEPS),
+        "held": bool(run.get("held")),  # input holds between samples, else straight lines
+        "area": np.concatenate([[0.0], np.cumsum(run["drive"][:-1] * np.diff(run["t"]))]),
+    }
+    return march(p, columns(rows), whole, "C_coil" in theta)
+
+
+def march_compiled(p: States, e: States, run: dict, heated: bool) -> States:
+    """All rows through the compiled loop. `p` parameters and starts, `e` effect parameters, by name (m,)."""
+    out = {k: np.empty((len(p["gain"]), len(run["t"]))) for k in ("position", "velocity", "coil")}
+    dry = any(np.any(e[k] != _NEUTRAL[k]) for k in _DRY)
+    loops.motion(p, e, run, heated, dry, bool(np.any(e["actuator_delay.TD"])), **out)
+    return out
+
+
+def march_in_python(p: States, e: States, run: dict, heated: bool) -> States:
+    """The same as march_compiled: what it is compared with, and what tells how it goes."""
+    m, t, u, air = len(p["gain"]), run["t"], run["drive"], run["air"]
+    gain, mass, damping, stiffness = (p[k] for k in ("gain", "mass", "damping", "stiffness"))
+    ohm, heat_c, heat_g, copper = (p[k] for k in ("R", "C_coil", "G_coil", "copper"))
+    on = {k: bool(np.any(v != _NEUTRAL[k])) for k, v in e.items()}
+    dry = any(on[k] for k in _DRY)
+    x, v, coil = p["start"], np.zeros(m), p["start_coil"]
     rest = x.copy()  # creep: position of the damper in series
     bouc = np.zeros(m)
     x2, v2 = x.copy(), np.zeros(m)
-    substeps = run.get("substeps", SUBSTEPS)
-    stays = bool(run.get("held"))  # input holds between samples, else straight lines
+    substeps, stays = run["substeps"], run["held"]
     out = {k: np.empty((m, len(t))) for k in ("position", "velocity", "coil")}
-    heated = "C_coil" in theta
     delayed = on["actuator_delay.TD"]
     late = _delayed(run, stays)
     for k in range(len(t)):
@@ -185,15 +201,17 @@ def simulate(theta: dict, run: dict, rows: list[Variant]) -> dict[str, np.ndarra
     return out
 
 
+march = march_compiled
+
+
 def _delayed(run: dict, held: bool) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Mean of the drive between two times (m,), each row's own; exact where it is held, else that of the middle."""
     t, u = run["t"], run["drive"]
     if not held:
         return lambda begin, end: np.interp((begin + end) / 2, t, u)
-    area = np.concatenate([[0.0], np.cumsum(u[:-1] * np.diff(t))])
 
     def until(when: np.ndarray) -> np.ndarray:
-        return np.interp(when, t, area) + u[0] * np.minimum(when - t[0], 0.0)
+        return np.interp(when, t, run["area"]) + u[0] * np.minimum(when - t[0], 0.0)
 
     return lambda begin, end: (until(end) - until(begin)) / (end - begin)
 

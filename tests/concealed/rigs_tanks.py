@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.integrate import odeint
 
+from tests.concealed.compiled import loops
 from tests.concealed.rig import Scene, Suspect, clock, levels
 from tests.concealed.rigs_thermal import _draw, _fault, _parameter_block, sensor_suspects
 from tests.concealed.thermal import Variant
@@ -143,21 +146,7 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
     x_now = np.maximum(level, 1e-3)
     out = np.empty((len(t), len(names)))
     out[0] = x_now
-    special = bool(siphon.any() or clog.any())
-
-    def rate(x: np.ndarray, now: float, u: float) -> np.ndarray:
-        x = np.maximum(x, 0.0)
-        flow = k * x**power
-        if special:  # a siphon that starts above 5 V; a filter that clogs in cycles
-            flow = (
-                flow * (1 + siphon / (1 + np.exp(-(x - 4.0) / 0.05))) * (1 - clog * ((now % 700.0) / 700.0))
-            )
-        spill = np.maximum(x - rim, 0.0) * 5.0
-        d = -flow - spill
-        d[0] += theta["k_pump"] * u
-        d[1:] += flow[:-1] + share * spill[:-1]
-        return d
-
+    rate = rate_of(float(theta["k_pump"]), k, power, rim, share, siphon, clog)
     change = np.flatnonzero(np.diff(sent)) + 1  # the input is constant from change to change
     edges = np.concatenate([[0.0], t[change] + late, [t[-1] + late + 1]])
     values = np.concatenate([[sent[0]], sent[change]])
@@ -176,3 +165,35 @@ def _integrate(names: list[str], theta: dict, row: Variant, run: dict) -> np.nda
         out[inside] = y[np.searchsorted(grid, t[inside])]
         x_now = y[-1]
     return out
+
+
+def rate_in_python(
+    k_pump: float,
+    k: np.ndarray,
+    power: np.ndarray,
+    rim: np.ndarray,
+    share: float,
+    siphon: np.ndarray,
+    clog: np.ndarray,
+) -> Callable[[np.ndarray, float, float], np.ndarray]:
+    """The same as loops.tank_rate: what it is compared with, and what tells how it goes."""
+    special = bool(siphon.any() or clog.any())
+
+    def rate(x: np.ndarray, now: float, u: float) -> np.ndarray:
+        """Rates (n,) V/s of the levels (n,) V at the time s and with the pump's V."""
+        x = np.maximum(x, 0.0)
+        flow = k * x**power
+        if special:  # a siphon that starts above 4 V; a filter that clogs in cycles
+            flow = (
+                flow * (1 + siphon / (1 + np.exp(-(x - 4.0) / 0.05))) * (1 - clog * ((now % 700.0) / 700.0))
+            )
+        spill = np.maximum(x - rim, 0.0) * 5.0
+        d = -flow - spill
+        d[0] += k_pump * u
+        d[1:] += flow[:-1] + share * spill[:-1]
+        return d
+
+    return rate
+
+
+rate_of = loops.tank_rate

@@ -7,7 +7,7 @@ spread over all, the sensor reads the mean. With x the volumes' temperatures
     z+ = exp(-lam h) z + phi1 F(z) ;  z+ += phi2 (F(z+) - F(z))      ETD2RK in the eigenvectors of C^-1/2 L C^-1/2
 
 All that is not linear and constant (changed parameters, effects) is in f. Many variants (rows) go through together;
-effects are arrays of numbers, zero when absent.
+effects are arrays of numbers, zero when absent. The loop over samples is compiled (loops.pyx); march_in_python is the same.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tests.concealed import sensors
+from tests.concealed.compiled import loops
 
 KELVIN = 273.15
 
@@ -42,115 +43,157 @@ class Network:
     stiffness: float = 150.0
 
 
+def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.ndarray:
+    """Mean temperatures (m, N, bodies), degC, of every variant; `run`: t (s), air, heats (W), velocity, position."""
+    return march(_modes(net, theta, run), Rows(net, theta, rows, run), run)
+
+
+def march_compiled(modes: Modes, v: Rows, run: dict) -> np.ndarray:
+    """All rows (m, N, bodies) through the compiled loop."""
+    out = np.empty((len(v.g), len(run["t"]), len(modes.c0)))
+    loops.thermal(modes, v, run, out)
+    return out
+
+
 @np.errstate(
     over="ignore", invalid="ignore"
 )  # a rival too large for the rig runs away: its row is not finite
-def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.ndarray:
-    """Mean temperatures (m, N, bodies), degC, of every variant; `run`: t (s), air, heats (W), velocity, position."""
-    names, flows = list(net.bodies), list(net.edges)
-    nb, ne, m, cells = len(names), len(flows), len(rows), net.cells
-    at = {n: i for i, n in enumerate(names)}
-    c0 = np.array([theta[p] for p in net.bodies.values()])
-    g0 = np.array([theta[net.edges[f][0]] for f in flows])
-    a = np.array([at[net.edges[f][1]] for f in flows])
-    b = np.array([at.get(net.edges[f][2], nb) for f in flows])  # nb stands for the air
-    into = np.zeros((ne, nb + 1))
-    into[np.arange(ne), a] -= 1
-    into[np.arange(ne), b] += 1
-    into = into[:, :nb]
-
-    # the linear operator and its modes
-    n = nb * cells
-    lin = np.zeros((n, n))
-    surface = np.arange(nb) * cells
-    for e in range(ne):
-        i = surface[a[e]]
-        lin[i, i] += g0[e]
-        if b[e] < nb:
-            j = surface[b[e]]
-            lin[j, j] += g0[e]
-            lin[i, j] -= g0[e]
-            lin[j, i] -= g0[e]
-    touching = np.array([g0[(a == k) | (b == k)].sum() for k in range(nb)])
-    for k in range(nb):
-        g = run.get("stiffness", net.stiffness) * max(touching[k], 1e-3) * cells
-        for c in range(cells - 1):
-            i = surface[k] + c
-            lin[i : i + 2, i : i + 2] += g * np.array([[1, -1], [-1, 1]])
-    root = np.sqrt(np.repeat(c0 / cells, cells))
-    lam, vec = np.linalg.eigh(lin / np.outer(root, root))
-    lam = np.maximum(lam, 1e-9)
-    to_surface = (vec[surface] / root[surface, None]).T  # modes -> surface temperatures
-    mean = np.zeros((nb, n))
-    for k in range(nb):
-        mean[k, surface[k] : surface[k] + cells] = 1 / cells
-    to_mean = ((mean / root) @ vec).T
-    read = np.concatenate([to_surface, to_mean], axis=1)
-    from_force = np.concatenate([to_surface.T, to_mean.T], axis=0)  # W at the surfaces, W spread over bodies
-
-    v = _Arrays(net, theta, rows, names, flows, run)
+def march_in_python(modes: Modes, v: Rows, run: dict) -> np.ndarray:
+    """The same as march_compiled: what it is compared with, and what tells how it goes."""
+    nb, m, a, b = len(modes.c0), len(v.g), modes.a, modes.b
     t, air = run["t"], run["air"]
     h = np.diff(t)
-    x0 = np.full((m, nb), air[0]) + run.get("start", np.zeros(nb)) + v.start
-    z = (np.repeat(x0, cells, axis=1) * root) @ vec
-    hidden = np.where(v.hid_air > 0, air[0], x0)
+    z, hidden = modes.start(v, run), modes.hidden_start(v, run)
     out = np.empty((m, len(t), nb))
     heat_total = [np.asarray(run[name], float) for name in v.heat_columns]
 
     def force(
         z: np.ndarray, hidden: np.ndarray, k: int, air_now: float, now: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        temps = z @ read
+        temps = z @ modes.read
         ts, tm = temps[:, :nb], temps[:, nb:]
         other = np.concatenate([ts, np.full((m, 1), air_now)], axis=1)[:, b]
         drop = ts[:, a] - other
         g = v.g if not v.g_varies else v.conductance(ts[:, a], k, now)
         flux = g * drop
-        linear = g0 * (ts[:, a] - np.where(b < nb, other, 0.0))
-        net_w = flux @ into
-        surface_w = (flux - linear) @ into
+        linear = modes.g0 * (ts[:, a] - np.where(b < nb, other, 0.0))
+        net_w = flux @ modes.into
+        surface_w = (flux - linear) @ modes.into
         extra, heat, hidden_rate = v.extra(ts, tm, hidden, k, air_now, now, heat_total)
         surface_w = surface_w + extra
         volume_w = heat
         if v.c_varies:
-            volume_w = volume_w + (c0 / v.capacity(tm) - 1) * (net_w + extra + heat)
-        return np.concatenate([surface_w, volume_w], axis=1) @ from_force, hidden_rate
+            volume_w = volume_w + (modes.c0 / v.capacity(tm) - 1) * (net_w + extra + heat)
+        return np.concatenate([surface_w, volume_w], axis=1) @ modes.push, hidden_rate
 
     for k in range(len(t)):
-        out[:, k] = z @ to_mean
+        out[:, k] = z @ modes.read[:, nb:]
         if k == len(h):
             break
-        e = np.exp(-lam * h[k])
-        phi1 = -np.expm1(-lam * h[k]) / lam
-        phi2 = np.where(lam * h[k] > 1e-4, (1 - phi1 / h[k]) / lam, h[k] / 2)
         f0, d0 = force(z, hidden, k, air[k], t[k] - t[0])
-        z1 = z * e + phi1 * f0
+        z1 = z * modes.decay[k] + modes.phi1[k] * f0
         h1 = hidden + h[k] * d0
         f1, d1 = force(z1, h1, k, air[k + 1], t[k + 1] - t[0] - 1e-9)
-        z = z1 + phi2 * (f1 - f0)
+        z = z1 + modes.phi2[k] * (f1 - f0)
         hidden = hidden + h[k] / 2 * (d0 + d1)
     return out
 
 
-class _Arrays:
+march = march_compiled
+
+
+class Modes:
+    """The linear operator of a network and its modes.
+
+    `rate` (n,) 1/s; `read` (n, 2 bodies): modes to the temperatures of surfaces, then to means; `push` (2 bodies, n): W at
+    the surfaces, then spread over the bodies, to modes; `decay`, `phi1`, `phi2` (N-1, n): each sample's step."""
+
+    def __init__(self, net: Network, c0: np.ndarray, g0: np.ndarray, stiffness: float, t: np.ndarray):
+        names, flows = list(net.bodies), list(net.edges)
+        nb, ne, cells = len(names), len(flows), net.cells
+        at = {n: i for i, n in enumerate(names)}
+        self.c0, self.g0 = c0, g0
+        self.a = a = np.array([at[net.edges[f][1]] for f in flows])
+        self.b = b = np.array([at.get(net.edges[f][2], nb) for f in flows])  # nb stands for the air
+        self.into = np.zeros((ne, nb + 1))
+        self.into[np.arange(ne), a] -= 1
+        self.into[np.arange(ne), b] += 1
+        self.into = self.into[:, :nb]
+        n = nb * cells
+        lin = np.zeros((n, n))
+        surface = np.arange(nb) * cells
+        for e in range(ne):
+            i = surface[a[e]]
+            lin[i, i] += g0[e]
+            if b[e] < nb:
+                j = surface[b[e]]
+                lin[j, j] += g0[e]
+                lin[i, j] -= g0[e]
+                lin[j, i] -= g0[e]
+        touching = np.array([g0[(a == k) | (b == k)].sum() for k in range(nb)])
+        for k in range(nb):
+            g = stiffness * max(touching[k], 1e-3) * cells
+            for c in range(cells - 1):
+                i = surface[k] + c
+                lin[i : i + 2, i : i + 2] += g * np.array([[1, -1], [-1, 1]])
+        self.root = root = np.sqrt(np.repeat(c0 / cells, cells))
+        lam, self.vec = np.linalg.eigh(lin / np.outer(root, root))
+        self.rate = lam = np.maximum(lam, 1e-9)
+        to_surface = (self.vec[surface] / root[surface, None]).T
+        mean = np.zeros((nb, n))
+        for k in range(nb):
+            mean[k, surface[k] : surface[k] + cells] = 1 / cells
+        to_mean = ((mean / root) @ self.vec).T
+        self.read = np.concatenate([to_surface, to_mean], axis=1)
+        self.push = np.ascontiguousarray(self.read.T)
+        h = np.diff(t)[:, None]
+        self.decay = np.exp(-lam * h)
+        self.phi1 = -np.expm1(-lam * h) / lam
+        self.phi2 = np.where(lam * h > 1e-4, (1 - self.phi1 / h) / lam, h / 2)
+        self.cells = cells
+
+    def start(self, v: Rows, run: dict) -> np.ndarray:
+        """The modes (m, n) at the beginning."""
+        return (np.repeat(v.at_start(run), self.cells, axis=1) * self.root) @ self.vec
+
+    def hidden_start(self, v: Rows, run: dict) -> np.ndarray:
+        """The hidden masses (m, bodies) at the beginning, degC: as their body, or as the air if they touch it."""
+        return np.where(v.body["hid_air"] > 0, run["air"][0], v.at_start(run))
+
+
+_kept: dict[tuple, Modes] = {}  # of the rig at hand: its two runs, in truth and as recorded
+
+
+def _modes(net: Network, theta: dict, run: dict) -> Modes:
+    c0 = np.array([theta[p] for p in net.bodies.values()], float)
+    g0 = np.array([theta[g] for g, _, _ in net.edges.values()], float)
+    stiffness = run.get("stiffness", net.stiffness)
+    wiring = (tuple(net.bodies), tuple(net.edges.values()), net.cells)
+    key = (*wiring, stiffness, c0.tobytes(), g0.tobytes(), run["t"].tobytes())
+    if key not in _kept:
+        while len(_kept) > 3:
+            del _kept[next(iter(_kept))]
+        _kept[key] = Modes(net, c0, g0, stiffness, run["t"])
+    return _kept[key]
+
+
+class Rows:
     """The variants of a batch as arrays (m, bodies) and (m, flows)."""
 
-    def __init__(
-        self, net: Network, theta: dict, rows: list[Variant], names: list[str], flows: list[str], run: dict
-    ):
+    def __init__(self, net: Network, theta: dict, rows: list[Variant], run: dict):
+        names, flows = list(net.bodies), list(net.edges)
         m, nb, ne = len(rows), len(names), len(flows)
-        self.names, self.run = names, run
+        self.run = run
         at = {n: i for i, n in enumerate(names)}
         full = [{**theta, **r.theta} for r in rows]
-        self.g = np.array([[p[net.edges[f][0]] for f in flows] for p in full])
-        self.c = np.array([[p[c] for c in net.bodies.values()] for p in full])
+        self.g = np.array([[p[net.edges[f][0]] for f in flows] for p in full], float)
+        self.c = np.array([[p[c] for c in net.bodies.values()] for p in full], float)
         self.start = np.array([[r.start.get(n, 0.0) for n in names] for r in rows])
         body = {
             k: np.zeros((m, nb))
             for k in ("rad", "nat", "q", "eddy", "hyst", "cap", "base", "hid_g", "hid_air", "melt", "burst")
         }
-        edge = {k: np.zeros((m, ne)) for k in ("temp", "pos", "step", "fan", "fatigue")}
-        edge["forced"] = np.zeros((m, ne))
+        edge = {k: np.zeros((m, ne)) for k in ("temp", "pos", "step", "fan", "forced")}
         self.hid_c = np.ones((m, nb))
         self.t0, self.t1 = np.zeros((m, 1)), np.full((m, 1), 1e12)
         self.split = np.zeros((m, len(net.joule), nb))
@@ -206,32 +249,55 @@ class _Arrays:
                     pass
                 else:
                     raise KeyError(effect)
-        self.body = {k: x for k, x in body.items() if np.any(x)}
-        self.hid_g, self.hid_air = body["hid_g"], body["hid_air"]
-        self.edge = {k: x for k, x in edge.items() if np.any(x)}
-        self.g_varies = bool(self.edge)
+        self.body, self.edge = body, edge
+        self.present = {k for k, x in (body | edge).items() if np.any(x)}
+        self.g_varies = bool(self.present & set(edge))
         self.fan_on = np.zeros((m, ne))
-        self.cap, self.melt = body["cap"], body["melt"]
         c_truth = np.array([theta[c] for c in net.bodies.values()])
-        self.c_varies = bool(np.any(self.cap) or np.any(self.melt) or np.any(self.c != c_truth))
+        self.c_varies = bool(self.present & {"cap", "melt"} or np.any(self.c != c_truth))
         self.heat_columns = [f"heat:{q}" for q in heats]
         self.heat_body = np.array([at[net.joule[q][0]] for q in heats])
-        self.split_any = bool(np.any(self.split))
-        self.heat_scale = np.array([[p.get(f"scale:{q}", 1.0) for q in heats] for p in full])
-        self.to_air = np.array([net.edges[f][2] == "air" for f in flows])
+        self.heat_scale = np.array([[p.get(f"scale:{q}", 1.0) for q in heats] for p in full], float)
+
+    def at_start(self, run: dict) -> np.ndarray:
+        """Temperatures (m, bodies) at the beginning, degC."""
+        return np.full(self.start.shape, run["air"][0]) + run.get("start", 0.0) + self.start
+
+    def needed(self, modes: Modes) -> np.ndarray:
+        """The temperatures (m, 2 bodies: surfaces, then means) on which a row's forces depend, as 0 and 1."""
+        need = np.zeros((len(self.g), 2 * len(modes.c0)), np.uint8)
+        surface, mean = np.split(need, 2, axis=1)  # views
+        resized = (self.c != modes.c0) | (self.body["cap"] != 0) | (self.body["melt"] != 0)
+        mean |= resized
+        for q, body in enumerate(self.heat_body):
+            mean[:, body] |= self.copper[:, q] != 0
+        for k in set(self.body) - {"cap", "melt"}:
+            surface |= self.body[k] != 0
+        varied = self.g != modes.g0
+        for x in self.edge.values():
+            varied = varied | (x != 0)
+        for e, (a, b) in enumerate(zip(modes.a, modes.b, strict=True)):
+            inside = [i for i in (a, b) if i < len(modes.c0)]
+            near = varied[:, e] | resized[:, inside].any(axis=1)  # a resized body's whole inflow counts
+            for i in inside:
+                surface[:, i] |= near
+        for r, i, j, _ in self.links:
+            surface[r, [i, j]] = 1
+        surface |= resized
+        return need
 
     def conductance(self, source: np.ndarray, k: int, now: float) -> np.ndarray:
         """Conductances (m, flows), W/K."""
         g = self.g
-        if "temp" in self.edge:
+        if "temp" in self.present:
             g = g * np.maximum(1 + self.edge["temp"] * (source - 20), 0.05)
-        if "step" in self.edge:
+        if "step" in self.present:
             g = g * (1 + self.edge["step"] * (now >= self.t0))
-        if "forced" in self.edge:
+        if "forced" in self.present:
             g = g * (1 + self.edge["forced"] * abs(self.run["velocity"][k]) ** 0.5)
-        if "pos" in self.edge:
+        if "pos" in self.present:
             g = g * (1 + self.edge["pos"] * self.run["position"][k])
-        if "fan" in self.edge:
+        if "fan" in self.present:
             excess = source - self.run["air"][k]
             self.fan_on = np.where(excess > 8, 1.0, np.where(excess < 5, 0.0, self.fan_on))
             g = g * (1 + self.edge["fan"] * self.fan_on)
@@ -239,9 +305,9 @@ class _Arrays:
 
     def capacity(self, tm: np.ndarray) -> np.ndarray:
         """Storages (m, bodies), J/K."""
-        c = self.c * np.maximum(1 + self.cap * (tm - 20), 0.1)
-        if np.any(self.melt):
-            c = c * (1 + self.melt * np.exp(-0.5 * ((tm - self.run["melt_at"]) / 1.0) ** 2))
+        c = self.c * np.maximum(1 + self.body["cap"] * (tm - 20), 0.1)
+        if "melt" in self.present:
+            c = c * (1 + self.body["melt"] * np.exp(-0.5 * ((tm - self.run["melt_at"]) / 1.0) ** 2))
         return c
 
     def extra(self, ts, tm, hidden, k, air, now, heats):
@@ -249,31 +315,31 @@ class _Arrays:
         w = np.zeros_like(ts)
         b = self.body
         rise = ts - air
-        if "rad" in b:
+        if "rad" in self.present:
             w -= b["rad"] * ((ts + KELVIN) ** 4 - (air + KELVIN) ** 4)
-        if "nat" in b:
+        if "nat" in self.present:
             w -= b["nat"] * rise * np.abs(rise) ** 0.25
-        if "q" in b:
+        if "q" in self.present:
             w += b["q"] * ((now >= self.t0) & (now < self.t1))
-        if "eddy" in b:
+        if "eddy" in self.present:
             w += b["eddy"] * self.run["velocity"][k] ** 2
-        if "hyst" in b:
+        if "hyst" in self.present:
             w += b["hyst"] * abs(self.run["velocity"][k])
-        if "base" in b:
+        if "base" in self.present:
             w -= b["base"] * (ts - self.run["base"][k])
-        if "burst" in b:
+        if "burst" in self.present:
             w -= b["burst"] * np.maximum(rise - 4, 0) * (now % 240 < 40)
         for r, i, j, g in self.links:
             w[r, i] -= g * (ts[r, i] - ts[r, j])
             w[r, j] += g * (ts[r, i] - ts[r, j])
-        flow = self.hid_g * (ts - hidden)
+        flow = b["hid_g"] * (ts - hidden)
         w -= flow
-        rate = (flow - self.hid_air * (hidden - air)) / self.hid_c
+        rate = (flow - b["hid_air"] * (hidden - air)) / self.hid_c
         heat = np.zeros_like(ts)
         for q, (body, column) in enumerate(zip(self.heat_body, heats, strict=True)):
             watts = column[k] * self.heat_scale[:, q] * (1 + self.copper[:, q] * (tm[:, body] - 20))
             heat[:, body] += watts
-            if self.split_any:
+            if np.any(self.split):
                 share = self.split[:, q] * watts[:, None]
                 heat += share
                 heat[:, body] -= share.sum(axis=1)
