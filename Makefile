@@ -31,7 +31,7 @@ bench-law: develop                 # cost of a call of the law, by compiler
 	$(BIN)/python tests/bench/law_call.py
 
 # Tests that only compute share two cores; then those that run in real time have both to themselves.
-COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs)
+COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs truth)
 # Property tests repeat the same examples (Hypothesis profile ci): a clean checkout that passes, passes again.
 EXAMPLES ?= ci
 test: develop lint                 # lint and all quick tests; EXAMPLES=default draws new examples of the properties
@@ -44,6 +44,10 @@ NUMBER ?= 600
 prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED)
 	$(BIN)/python -m tests.proof $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
+
+.PHONY: truth
+truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60
+	$(BIN)/python -m tests.truth --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(OLD),--old $(OLD))
 
 CALIBRATION ?= build/calibration
 calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue

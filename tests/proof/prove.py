@@ -47,7 +47,7 @@ def prove(
     figures = {
         "format": "thermoctl-proof/1",
         "version": __version__,
-        "commit": _commit(),
+        "commit": commit(),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
         "set": {"answers_sha256": hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()},
@@ -76,8 +76,8 @@ def _duration(recordings: Sequence[str]) -> float | None:
     return float(t[-1] - t[0])
 
 
-def _commit() -> str | None:
-    """Read the source's commit, `-dirty` when changed since; None outside a checkout."""
+def commit() -> str | None:
+    """Return the source's commit, `-dirty` when changed since; None outside a checkout."""
     if shutil.which("git") is None:
         return None
     run = subprocess.run(

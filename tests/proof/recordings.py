@@ -64,14 +64,16 @@ def real(
         raise InputError(
             f"{folder}: none of the known rigs is here ({', '.join(sorted({r.folder for r in RIGS}))})"
         )
-    jobs = [_job(folder, r) for r in rigs]
+    jobs = [rig_job(folder, r) for r in rigs]
     run_all(jobs, out / "cases", scheduler, workers, progress=progress)
     entries = [_entry(r, *outcome(j, out / "cases")) for r, j in zip(rigs, jobs, strict=True)]
     write_text(out / "real.json", json.dumps([asdict(e) for e in entries], indent=1) + "\n")
     return entries
 
 
-def _job(folder: Path, rig: Rig) -> Job:
+def rig_job(folder: Path, rig: Rig) -> Job:
+    """Return the diagnosis of a rig whose recordings are below `folder`."""
+
     def files(names: str) -> tuple[str, ...]:
         """Return the paths of the rig's recordings; `names`: separated by spaces."""
         return tuple(str(folder / rig.folder / f"{n}{SUFFIX}") for n in names.split())

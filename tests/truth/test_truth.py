@@ -1,0 +1,123 @@
+"""How `make truth` judges: hand-made cases, results and changes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+
+from tests.proof.recordings import VARIABLE
+from tests.truth import __main__ as truth
+from tests.truth import cases as made
+from tests.truth import judge, run
+
+
+def result(verdict: str, *names: tuple[str, str, float]) -> dict:
+    findings = [
+        {"effect": e, "where": w, "probability": p, "when": None, "parameters": {}} for e, w, p in names
+    ]
+    return {"verdict": verdict, "findings": findings, "alternatives": [], "fit": {}}
+
+
+def a_case(folder, answer: dict, kind=made._foreign):
+    folder.mkdir(parents=True)
+    (folder / "plant.yaml").write_text("title: none\n")
+    for run_file in ("run_1.csv", "run_2.csv"):
+        (folder / run_file).write_text("t,y\n0,1\n")
+    (folder / "answer.yaml").write_text(yaml.safe_dump(answer))
+    return kind(folder)
+
+
+def test_names_of_other_peoples_systems_are_right_at_their_place_only(tmp_path):
+    answer = {
+        "verdict": ["explained"],
+        "named": [[["a", "b"], "x"], ["missing_link", "p-q"]],
+        "held_out": "run_2.csv",
+    }
+    case = a_case(tmp_path / "two", answer)
+    assert [case.judge(n) for n in (("b", "x"), ("b", "y"), ("missing_link", "q-p"))] == [
+        "right",
+        "stray",
+        "right",
+    ]
+    assert [p.rsplit("/")[-1] for p in (*case.job.recordings, *case.job.held_out)] == [
+        "run_1.csv",
+        "run_2.csv",
+    ]
+
+
+def test_a_generated_case_takes_an_equivalent_name_and_is_a_trap_without_an_effect(tmp_path):
+    answer = {
+        "verdict": "explained",
+        "effects": [["radiation", "a"]],
+        "nearly_the_same": ["natural_convection"],
+        "kind": "one",
+    }
+    case = a_case(tmp_path / "0001", answer, lambda f: made._generated("closed", f))
+    assert [case.judge(n) for n in (("natural_convection", "a"), ("radiation", "b"))] == ["right", "stray"]
+    strange = {"verdict": "unexplained", "effects": [["?", "a"]], "nearly_the_same": [], "kind": "unknown"}
+    trap = a_case(tmp_path / "0002", strange, lambda f: made._generated("closed", f))
+    assert not trap.wanted and trap.judge(("radiation", "a")) == "stray"
+
+
+def test_figures_of_a_hand_made_group(tmp_path):
+    one = a_case(tmp_path / "one", {"named": [["a", "x"]]})
+    trap = a_case(tmp_path / "trap", {"named": []})
+    rows = [
+        judge.row(one, result("explained", ("a", "x", 0.995), ("b", "x", 0.95)), 4.0, None),
+        judge.row(one, result("ambiguous", ("a", "x", 0.6)), 2.0, None),
+        judge.row(trap, result("explained", ("c", "x", 0.97)), 3.0, None),
+        judge.row(trap, result("explained", ("c", "x", 0.5)), 1.0, None),
+        judge.row(trap, None, 0.0, "ValueError: no"),
+    ]
+    told = judge.figures(rows)
+    assert told["right names"].startswith("1/2 ") and told["traps refused"].startswith("2/3 ")
+    assert (told["strays at 0.9"], told["strays"], told["failed"]) == ("2", "3", "1")
+    assert told["not wrong at 0.99"].startswith("1/1 ") and told["not wrong at 0.9"].startswith("1/3 ")
+    assert (told["CPU s, mean"], told["longest"]) == ("2.00", "4.0")
+    assert float(told["log score"]) == pytest.approx(-1.54, abs=0.006)  # of 0.995, 0.05, 0.6, 0.03, 0.5
+
+
+def test_what_changed_is_told_by_case(tmp_path):
+    case = a_case(tmp_path / "one", {"named": [["a", "x"], ["d", "x"]]})
+
+    def rows(verdict, *names):
+        return {"one": judge.row(case, result(verdict, *names), 1.0, None)}
+
+    old = rows("explained", ("a", "x", 0.95), ("b", "x", 0.99))
+    new = rows("ambiguous", ("d", "x", 0.9), ("c", "x", 0.9), ("b", "x", 0.5))
+    assert [(kind, what.split()[0]) for _, kind, what in judge.changes(old, new)] == [
+        ("named", "d"),
+        ("lost", "a"),
+        ("false", "c"),
+        ("cleared", "b"),
+        ("verdict", "explained"),
+    ]
+    assert list(judge.changes(old, old)) == []
+
+
+def test_the_command_compares_with_the_older_result(tmp_path, monkeypatch, capsys):
+    """Folders that are missing are said; a stored result and the new one stand side by side."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv(made.FOREIGN, str(tmp_path / "systems"))
+    case = a_case(tmp_path / "systems" / "one", {"named": [["a", "x"]]})
+
+    def diagnosed(jobs, out, task, **how):
+        for job in jobs:
+            folder = out / job.name
+            folder.mkdir(parents=True, exist_ok=True)
+            run._write(folder / "diagnosis.json", result("explained", ("a", "x", 0.97)))
+            run._write(folder / "run.json", {"name": job.name, "error": None, "cpu_s": 3.0})
+
+    monkeypatch.setattr(truth, "run_all", diagnosed)
+    before = judge.row(case, result("consistent"), 6.0, None)
+    (tmp_path / "old.json").write_text(
+        json.dumps({"commit": "abc", "date": "2026-01-01", "cases": {"one": before}})
+    )
+    words = ["--only", "home,foreign", "--out", str(tmp_path / "out"), "--old", str(tmp_path / "old.json")]
+    assert truth.main(words) == 0
+    printed = capsys.readouterr()
+    assert f"without real rigs: {VARIABLE}" in printed.err
+    assert "- one: *named* a at x (0.970)" in printed.out and "consistent -> explained" in printed.out
+    assert printed.out.count("| other people's systems |") == 2
