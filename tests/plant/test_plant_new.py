@@ -66,10 +66,10 @@ def test_a_strangers_rig_in_ten_minutes(folder, capsys):
     assert "time taken from column 'Zeit'" in printed.err and "decimal comma" in printed.err
     assert "it heats 'Block'" in printed.out and "touch" in printed.out
     plant = load("rig.yaml")
-    assert list(plant.inputs) == ["P_Heizung", "T_Luft"] and list(plant.nodes) == ["Block", "K_hler"]
+    assert list(plant.inputs) == ["P_Heizung", "T_Luft"] and list(plant.nodes) == ["Block", "Kuehler"]
     assert 0.01 < plant.outputs["T_Block"].noise_sd < 0.1
     text = (folder / "rig.yaml").read_text()
-    for name, value in (("C_Block", 90), ("C_K_hler", 150)):  # two edits, from the parts' data sheets
+    for name, value in (("C_Block", 90), ("C_Kuehler", 150)):  # two edits, from the parts' data sheets
         known = f"{name}: {{value: {value}, unit: J/K}}"
         text, edits = re.subn(rf"{name}: \{{value: \S+, unit: J/K, range: .*\]\}}", known, text)
         assert edits == 1
@@ -111,14 +111,21 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
 @pytest.mark.parametrize(
     "args, text, says",
     [
+        ([], "", "--from-csv RECORDING or --template NAME"),
         (
             ["--from-csv", "a.csv", "--template", "block"],
-            "",
-            "either --from-csv RECORDING or --template NAME",
+            "t,T [degC]\n0,1\n1,2\n",
+            "no column is recognised as it",
+        ),
+        (["--from-csv", "a.csv"], "t,a,b\n0,1,3\n1,2,3\n", "write the units: --outputs 'COLUMN [degC]'"),
+        (
+            ["--from-csv", "a.csv", "--inputs", "b"],
+            "t,T [degC],b\n0,1,3\n1,2,3\n",
+            "tells what 'b' is (from 3 to 3)",
         ),
         (["--template", "blok"], "", "did you mean 'block'"),
-        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "no temperature"),
-        (["--from-csv", "a.csv"], "t,T [degC]\n0,1\n1,2\n", "no power"),
+        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "recognised as what moves it"),
+        (["--from-csv", "a.csv"], "t,T [degC]\n0,1\n1,2\n", "recognised as what heats it"),
         (
             ["--from-csv", "a.csv", "--outputs", "P"],
             "t,P [W],T [degC]\n0,1,2\n1,2,2\n",
@@ -150,3 +157,143 @@ def test_columns_without_units_are_named_by_hand(folder, capsys):
     values = {n: p.value for n, p in plant.parameters.items()}
     assert values["G_body_q_2nd_probe"] == pytest.approx(20 / 30, rel=0.05)
     assert values["C_body_q_2nd_probe"] == pytest.approx(200 * 20 / 30, rel=0.05)
+
+
+HEATED = (  # drive, air, body in the words of loggers in many languages, none with a unit
+    ("heat", "air_temperature", "temperature_1"),
+    ("Heizleistung", "Umgebungstemperatur", "Blocktemperatur"),
+    ("Leistung", "T_Luft", "T_Kühler"),
+    ("puissance_chauffage", "température_ambiante", "température_bloc"),
+    ("potenza", "temp_aria", "temp_blocco"),
+    ("potencia", "temperatura ambiente", "temperatura del bloque"),
+    ("vermogen", "omgevingstemperatuur", "bloktemperatuur"),
+    ("moc grzałki", "temperatura otoczenia", "temperatura bloku"),
+    ("heaterPower", "ambientTemp", "blockTemp"),
+    ("Q1", "Tamb", "T1"),
+    ("P_heizung", "Raumtemp", "TC1"),
+    ("watts", "T_outdoor", "T_room"),
+    ("effekt", "omgivning", "temp_block"),
+)
+
+
+def heated(folder, names, factor=1.0):
+    """A recording of one heated body, 20 K above its air after a while."""
+    t = np.arange(0.0, 900.0, 3.0)
+    drive = np.where(t < 600, 10.0, 0.0) * factor
+    warm = 21 + 20 * (1 - np.exp(-t / 200))
+    head = ",".join(("t", *names))
+    rows = "\n".join(
+        f"{a:g},{b:g},{21.3 + 1e-4 * a:.3f},{c:.3f}" for a, b, c in zip(t, drive, warm, strict=True)
+    )
+    (folder / "a.csv").write_text(f"{head}\n{rows}\n", encoding="utf-8")
+    (folder / "p.yaml").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("names", HEATED)
+def test_columns_without_units_are_recognised_and_never_a_power(folder, names, capsys):
+    heated(folder, names)
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    drive, air = plant.inputs.values()
+    assert (drive.column, drive.unit) == (names[0], None) and (air.column, air.role) == (names[1], "ambient")
+    assert [o.column for o in plant.outputs.values()] == [names[2]]
+    assert [p.name for p in plant.parameters.values() if p.unit == "W"] == [f"W_{drive.name}"]
+    printed = capsys.readouterr().out
+    assert f"'{names[1]}' has no unit" in printed and f"watts for each unit of '{names[0]}'" in printed
+
+
+def test_a_unit_by_hand_and_a_name_that_says_nothing(folder, capsys):
+    heated(folder, ("a", "b", "c"))
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 2
+    assert "write the units" in capsys.readouterr().err and not (folder / "p.yaml").exists()
+    args = ["--inputs", "a [mW], b [degC]", "--outputs", "c [degC]"]
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *args]) == 0
+    plant = load("p.yaml")
+    assert plant.inputs["a"].unit == "W" and plant.inputs["a"].conversion.unit == "mW"
+    assert plant.inputs["b"].role == "ambient" and not [p for p in plant.parameters if p.startswith("W_")]
+
+
+@pytest.mark.parametrize(
+    ("drive", "rate", "parameter"),
+    [
+        ("Strom [A]", "R * Strom**2", "R"),
+        ("heater current (mA)", "R * heater_current**2", "R"),
+        ("corrente", "R * corrente**2", "R"),
+        ("U_heiz [V]", "U_heiz**2 / R", "R"),
+        ("PWM [%]", "P_full * PWM", "P_full"),
+    ],
+)
+def test_what_needs_a_number_from_the_user_has_a_question_mark(folder, drive, rate, parameter, capsys):
+    heated(folder, (drive, "air [degC]", "block [degC]"))
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    text = (folder / "p.yaml").read_text()
+    assert (
+        f'{parameter}: {{value: "?"' in text and "write it for the question mark" in capsys.readouterr().out
+    )
+    assert cli.main(["plant", "check", "p.yaml"]) == 2
+    assert (
+        "p.yaml:7:" in (error := capsys.readouterr().err)
+        and f"value of '{parameter}' is not known yet" in error
+    )
+    (folder / "p.yaml").write_text(text.replace('"?"', "0.37"))
+    plant = load("p.yaml")
+    assert str(plant.flows[next(iter(plant.flows))].rate) == rate
+
+
+def test_a_template_takes_the_columns_of_a_recording(folder, capsys):
+    t = np.arange(0.0, 60.0, 1.0)
+    rows = "\n".join(f"{a:g};3,0;41,0;22,0;30,0;35,0" for a in t)
+    head = "Zeit;Strom [A];Gehäuse [°C];Raumluft [°C];Flansch [°C];Wicklung [°C]"
+    (folder / "a.csv").write_text(f"{head}\n{rows}\n", encoding="utf-8")
+    assert cli.main(["plant", "new", "p.yaml", "--template", "motor", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    columns = {r.name: r.column for r in plant.readings()}
+    assert columns == {"current": "Strom", "air": "Raumluft", "T_winding": "Wicklung", "T_housing": "Gehäuse"}
+    assert "does not read: Flansch" in (folder / "p.yaml").read_text()
+    (folder / "p.yaml").unlink()
+    args = ["--columns", "T_housing=Flansch"]
+    assert cli.main(["plant", "new", "p.yaml", "--template", "motor", "--from-csv", "a.csv", *args]) == 0
+    assert load("p.yaml").outputs["T_housing"].column == "Flansch"
+    rows = "\n".join(f"{a:g},3,35" for a in t)  # neither air nor housing
+    (folder / "a.csv").write_text(f"t,I [A],T_coil [degC]\n{rows}\n")
+    (folder / "p.yaml").unlink()
+    assert cli.main(["plant", "new", "p.yaml", "--template", "motor", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    assert list(plant.outputs) == ["T_winding"] and plant.parameters["air"].value == 35
+    assert all(cli.main(["simulate", "--plant", "p.yaml", "a.csv"]) == 0 for _ in range(1))
+
+
+def swung(t, mass, damping, stiffness):
+    """Position and force of a mass with friction, and a spring where it has one."""
+    force = 5 * np.sin(2.1 * t) + 3 * np.sin(0.7 * t)
+
+    def slopes(now, x):
+        return [x[1], (np.interp(now, t, force) - damping * x[1] - stiffness * x[0]) / mass]
+
+    return force, solve_ivp(slopes, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-8, max_step=0.02).y
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 40.0])
+@pytest.mark.parametrize("head", ["t,Kraft [N],Position [mm]", "t,force [N],x [mm]"])
+def test_an_axis_becomes_mass_friction_and_a_spring_if_it_has_one(folder, stiffness, head):
+    t = np.arange(0.0, 30.0, 0.02)
+    force, (place, _) = swung(t, 2.0, 6.0, stiffness)
+    rows = "\n".join(f"{a:g},{b:.4f},{1e3 * c:.4f}" for a, b, c in zip(t, force, place, strict=True))
+    (folder / "a.csv").write_text(f"{head}\n{rows}\n")
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    values = {n: p.value for n, p in plant.parameters.items()}
+    assert values["mass"] == pytest.approx(2.0, rel=0.1) and values["damping"] == pytest.approx(6.0, rel=0.1)
+    assert values.get("stiffness", 0.0) == pytest.approx(stiffness, rel=0.1)
+
+
+def test_levels_and_a_pump_become_tanks(folder):
+    t, h, area, outlet = np.arange(0.0, 600.0, 1.0), [0.05], 0.02, 2e-4
+    pump = np.where((t // 100).astype(int) % 2 == 0, 8e-5, 3e-5)
+    for q in pump[:-1]:
+        h.append(h[-1] + (q - outlet * h[-1] ** 0.5) / area)
+    rows = "\n".join(f"{a:g},{6e4 * b:.4f},{100 * c:.4f}" for a, b, c in zip(t, pump, h, strict=True))
+    (folder / "a.csv").write_text(f"t,Zufluss [l/min],Füllstand [cm]\n{rows}\n", encoding="utf-8")
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    values = {n.split("_")[0]: p.value for n, p in load("p.yaml").parameters.items()}
+    assert values == {"area": pytest.approx(area, rel=0.05), "outlet": pytest.approx(outlet, rel=0.05)}

@@ -8,21 +8,23 @@ TABLE: Table = {
     MODEL: (
         command(
             "plant new",
-            "write a first plant file: from a recording of temperatures, or from a template",
+            "write a first plant file: from a recording, from a template, or a template that reads a recording",
             "thermoctl.plant.new:new",
             "",
             argument("file", metavar="FILE", help="the plant file to write"),
             argument(
                 "--from-csv",
                 metavar="REC",
-                help="a recording: one body for each thermometer, links to be confirmed",
+                help="a recording: of a thermal rig, an axis or tanks; guesses are marked `# confirm`",
             ),
             argument(
                 "--inputs",
                 metavar="A,B",
-                help="columns of inputs (default: powers, and the air's temperature)",
+                help="columns of inputs, with units where the file has none: 'P [W],air [degC]' (default: by kind)",
             ),
-            argument("--outputs", metavar="A,B", help="columns of sensors (default: the other temperatures)"),
+            argument(
+                "--outputs", metavar="A,B", help="columns of sensors, in the same way (default: by kind)"
+            ),
             TIME,
             COLUMNS,
             argument(

@@ -116,6 +116,12 @@ def _input(name: str, s: Section) -> Input:
 
 
 def _parameter(name: str, s: Section) -> Parameter:
+    if s.get("value").value == "?":
+        unit = s.text("unit", "")
+        raise s.get("value").error(
+            f"value of '{name}' is not known yet: write the number for the question mark"
+            + (f", in {unit}" if unit else "")
+        )
     value = s.number("value")
     limits = s.interval("range") if s.get("range", False) is not None else None
     if limits is not None and not limits[0] <= value <= limits[1]:

@@ -1,0 +1,1 @@
+"""First plant files, from a recording or a template."""

@@ -1,0 +1,169 @@
+"""Map a template's inputs and outputs to a recording's columns, by kind and by the place in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+
+from thermoctl.plant.files import loads
+from thermoctl.plant.first.columns import UNITS, Column, quoted, words
+from thermoctl.plant.first.thermal import confirm
+from thermoctl.plant.language import Input, Output, Plant
+from thermoctl.plant.units import dimension
+from thermoctl.recording.table import Table
+from thermoctl.shipped import shipped
+from thermoctl.yamlfile import InputError, suggest
+
+TEMPLATES = ("block", "motor", "hot-end", "room", "tank", "stage", "flexure", "actuator")
+# Words for the same place in several languages, one place a line.
+_PLACES = (
+    "winding wicklung bobinage enroulement avvolgimento bobinado devanado wikkeling coil spule bobine bobina stator",
+    "housing gehause gehaeuse carter boitier carcasa alloggiamento behuizing case casing frame body",
+    "block bloc blocco bloque blok hotend nozzle extruder duse duese heater",
+    "core kern noyau nucleo anker",
+    "room raum salle stanza sala kamer zimmer indoor inside innen interieur interno interior living wohnzimmer",
+    "fan lufter luefter ventilateur ventola ventilador",
+)
+_MOST = 7  # columns of one kind that are tried in every order
+
+
+def text(name: str) -> str:
+    """Return a template's text. Raises InputError for an unknown name."""
+    if name not in TEMPLATES:
+        raise InputError(f"no template '{name}'{suggest(name, TEMPLATES)}; there are {', '.join(TEMPLATES)}")
+    return (shipped("config/plants/templates") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def mapped(
+    name: str, table: Table, columns: Mapping[str, Column], chosen: Mapping[str, str]
+) -> tuple[str, list[str]]:
+    """Return a template's text with the columns of a table, and the names of the unused columns.
+
+    `chosen`: column by the template's name, from --columns. Raises InputError for an input without one."""
+    content = text(name)
+    plant = loads(content, name)
+    for own in chosen:
+        if own not in {r.name for r in plant.readings()}:
+            raise InputError(
+                f"--columns {own}: template '{name}' has no such input or output{suggest(own, [r.name for r in plant.readings()])}"
+            )
+    found = _assigned(plant, columns, chosen)
+    lacking = [i for i in plant.inputs.values() if i.name not in found and i.role != "ambient"]
+    if lacking:
+        raise InputError(
+            f"{table.path}: template '{name}' reads '{lacking[0].name}' [{lacking[0].unit}]; no column is recognised as it "
+            f"(columns {', '.join(table.columns)}): name it with --columns {lacking[0].name}=COLUMN"
+        )
+    if not any(o in found for o in plant.outputs):
+        wanted = ", ".join(f"{o.name} [{o.unit}]" for o in plant.outputs.values())
+        raise InputError(
+            f"{table.path}: no column is recognised as an output of template '{name}' ({wanted}); name one with "
+            f"--columns {next(iter(plant.outputs))}=COLUMN"
+        )
+    for item in plant.readings():
+        if item.name in found:
+            content = _with_column(content, item, found[item.name], item.name in chosen)
+        elif isinstance(item, Input):
+            content = _without_ambient(content, item, table, [found[o] for o in plant.outputs if o in found])
+        else:
+            content = _without_output(content, item, next(o for o in plant.outputs if o in found))
+    used = {c.name for c in found.values()}
+    return content, [c for c in table.columns if c not in used]
+
+
+def _assigned(plant: Plant, columns: Mapping[str, Column], chosen: Mapping[str, str]) -> dict[str, Column]:
+    """Return the column of each input and output: the assignment with the largest score."""
+    found = {own: columns[c] for own, c in chosen.items()}
+    free = [c for c in columns.values() if c not in found.values()]
+    for group in {(_kind(r), r.role == "ambient") for r in plant.readings()}:
+        items = [
+            r for r in plant.readings() if r.name not in found and (_kind(r), r.role == "ambient") == group
+        ]
+        fits = [c for c in free if _fits(c, *group)]
+        if group[1]:  # the surroundings: the column furthest out
+            fits = sorted((c for c in fits if c.outside), key=lambda c: -c.outside)[:1]
+        elif group[0] == "temperature":
+            inner = [c for c in fits if not c.outside]
+            fits = (
+                inner if len(inner) >= len(items) or not inner else [*inner, *(c for c in fits if c.outside)]
+            )
+        fits = fits[:_MOST]
+        best = max(
+            permutations([*fits, *[None] * len(items)], len(items)),
+            key=lambda p: sum(_score(r, c) for r, c in zip(items, p, strict=True)),
+            default=(),
+        )
+        found |= {r.name: c for r, c in zip(items, best, strict=True) if c is not None}
+        free = [c for c in free if c not in found.values()]
+    return found
+
+
+def _kind(item: Input | Output) -> str:
+    if item.role == "level":
+        return "level"
+    wanted = dimension(item.unit or "1")
+    return next(
+        k for k, u in UNITS.items() if dimension(u) == wanted and (k != "angle" or item.unit == "rad")
+    )
+
+
+def _fits(c: Column, kind: str, ambient: bool) -> bool:
+    if kind in ("angle", "duty"):  # a share: of a heater or of a fan
+        return (
+            c.kind in ("duty", "power")
+            and c.unit in ("", "%", "1")
+            or c.kind == ""
+            and bool(set(words(c.name)) & set(_PLACES[5].split()))
+        )
+    if ambient:
+        return c.kind == kind and bool(c.outside)
+    return c.kind == kind
+
+
+def _score(item: Input | Output, c: Column | None) -> float:
+    """Return how well a column's name fits an item's: a place in common, a word, none."""
+    if c is None:
+        return 0.0
+    own, its = set(words(item.name)), words(c.name)
+    places = [set(p.split()) for p in _PLACES]
+    same = any(own & p and any(w in p or any(len(q) > 4 and q in w for q in p) for w in its) for p in places)
+    other = any(not own & p and any(w in p for w in its) for p in places)
+    return (
+        1.0 + (2.0 if same else 0.0) + (1.0 if own & set(its) else 0.0) - (0.5 if other and not same else 0.0)
+    )
+
+
+def _with_column(content: str, item: Input | Output, c: Column, chosen: bool) -> str:
+    """Return the text with `column` in an item's line, and what is to be confirmed in its comment."""
+    match = _line(content, item.name)
+    odd = bool(c.unit) and not c.stated and c.unit != item.unit
+    column = f"{{name: {quoted(c.name)}, unit: {quoted(c.unit)}}}" if odd else quoted(c.name)
+    keys = "" if c.name == item.name and not odd else f", column: {column}"
+    doubt = c.doubt or ("" if chosen or c.name == item.name else f"'{c.name}' is '{item.name}'")
+    return content.replace(match[0], f"{match[1]}{keys}{match[2]}{confirm(doubt) or match[3]}", 1)
+
+
+def _without_ambient(content: str, item: Input, table: Table, outputs: Sequence[Column]) -> str:
+    """Return the text with the temperature of the air as a parameter."""
+    first = min(float(c.values(table)[0]) for c in outputs if c.kind == "temperature")
+    content = content.replace(_line(content, item.name)[0] + "\n", "", 1)
+    line = (
+        f"parameters:\n  {item.name}: {{value: {first:.4g}, unit: degC}}  # confirm: temperature of the air\n"
+    )
+    return content.replace("parameters:\n", line, 1)
+
+
+def _without_output(content: str, item: Output, other: str) -> str:
+    """Return the text without an output; its node starts like that of `other`."""
+    content = content.replace(_line(content, item.name, "value:")[0] + "\n", "", 1)
+    return content.replace(f"first({item.name})", f"first({other})")
+
+
+def _line(content: str, name: str, holds: str = "") -> re.Match[str]:
+    """Return the match of an item's line: up to the closing brace, the brace, the comment."""
+    found = re.search(
+        rf"^(  {re.escape(name)}: \{{{holds}[^\n]*?)(\}})([ ]*(?:#[^\n]*)?)$", content, re.MULTILINE
+    )
+    assert found is not None
+    return found
