@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from thermoctl.api.data import Data, tables_of
 from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
@@ -20,6 +22,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.diagnosis import diagnose as _diagnose
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import from_plain, load
+from thermoctl.plant.initial import last_state, with_start
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
@@ -41,19 +44,37 @@ def read(data: Data, time: str | None = None, columns: Mapping[str, str] | None 
 
 
 def simulate(
-    plant: Plant | str | Path, data: Data, parameters: Mapping[str, float] | None = None
+    plant: Plant | str | Path,
+    data: Data,
+    parameters: Mapping[str, float] | None = None,
+    x0: Mapping[str, float] | Data | None = None,
 ) -> Simulation:
     """Simulate freely on the inputs in `data`; outputs in `data` are compared. Raises InputError.
 
-    `parameters`: values that replace the plant's."""
+    `parameters`: values that replace the plant's. `x0`: initial values by node, "steady" for the steady state
+    of the first inputs, or a recording, whose last state is estimated. By default the plant file decides, and
+    the steady state where it needs readings that `data` lacks."""
     own = plant_of(plant)
     model = compile_plant(own.description, ())
     (table,) = tables_of(own.description, data)
     excitation = model.excitation(table)
+    with_start(model, excitation, _start(own, x0), parameters)
     try:
         return Simulation(own, excitation, model.run(excitation, parameters))
     except SimulationError as e:
         raise InputError(f"{own.description.file}: {e}") from None
+
+
+def _start(plant: Plant, x0: Mapping[str, float] | Data | None) -> Mapping[str, float] | str | None:
+    """Return initial values by node, "steady" or None; a recording's last state by node."""
+    if (
+        x0 is None
+        or x0 == "steady"
+        or (isinstance(x0, Mapping) and all(np.ndim(v) == 0 for v in x0.values()))
+    ):
+        return x0  # type: ignore[return-value]
+    (table,) = tables_of(plant.description, x0)
+    return last_state(plant.description, table)
 
 
 def refit(plant: Plant | str | Path, data: Data | Sequence[Data], tries: int = 0) -> Refit:

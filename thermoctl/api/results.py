@@ -51,6 +51,11 @@ class Simulation:
         return dict(zip(self.plant.description.nodes, self.run.x.T, strict=True))
 
     @property
+    def last(self) -> dict[str, float]:
+        """The nodes at the end: `x0` of a run that goes on from here."""
+        return {n: float(x[-1]) for n, x in self.states.items()}
+
+    @property
     def errors(self) -> dict[str, np.ndarray]:
         """Measured minus simulated; NaN where not measured."""
         return dict(zip(self.plant.description.outputs, (self.excitation.y - self.run.y).T, strict=True))

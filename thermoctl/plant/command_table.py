@@ -43,7 +43,7 @@ TABLE: Table = {
         ),
         command(
             "simulate",
-            "run a plant on recorded inputs and compare",
+            "run a plant on inputs, and compare where outputs were recorded",
             "thermoctl.plant.commands:simulate",
             "",
             PLANT,
@@ -51,6 +51,12 @@ TABLE: Table = {
             RECORDINGS,
             TIME,
             COLUMNS,
+            argument(
+                "--initial",
+                metavar="NODE=VALUE,...",
+                help="initial values of nodes; or `steady`, the steady state of the first inputs; or a recording: its last "
+                "state (default: the plant file's; without first readings the steady state)",
+            ),
             argument(
                 "--horizon",
                 type=float,

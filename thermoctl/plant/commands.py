@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,9 @@ from rich.table import Table as Grid
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
+from thermoctl.plant.ahead import ahead, all_uncertain
 from thermoctl.plant.estimate import Estimate, report, updated
+from thermoctl.plant.initial import last_state, with_start
 from thermoctl.plant.noise import coloured
 from thermoctl.plant.recordings import as_recorded, read_recordings
 from thermoctl.plant.refit import Fit, fit
@@ -25,9 +26,6 @@ from thermoctl.recording.logger import parsed_columns
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
-
-RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at the start of a block
-RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially
 
 
 def ends_of_tables(plant: Plant) -> dict[str, float]:
@@ -62,47 +60,85 @@ def simulate(args: argparse.Namespace) -> int:
     Prints figures; writes a file and a plot on request.
     """
     plant = load(args.plant, args.map)
+    initial = _initial(plant, args)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
-    model = compile_plant(_all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
+    model = compile_plant(all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
     for path, table in zip(args.recordings, _read(plant, args.recordings, args), strict=True):
         excitation = model.excitation(table)
+        if note := with_start(model, excitation, initial):
+            print(f"note: {path}: {note}", file=sys.stderr)
         _warn_of_tables(plant, path, float(excitation.t[-1]))
         try:
             if args.horizon:
-                x, y = ahead(model, excitation, args.horizon)
+                x, y, _ = ahead(model, excitation, args.horizon)
             else:
                 run = model.run(excitation)
                 x, y = run.x, run.y
         except SimulationError as e:
             raise InputError(f"{path}: {e}") from None
         runs.append((table, excitation, x, y))
-        grid = Grid(
-            title=f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run"),
-            title_justify="left",
-        )
-        for head in ("output", "samples", "rms error", "largest", "share of the range"):
-            grid.add_column(head, justify="left" if head == "output" else "right")
-        for j, o in enumerate(plant.outputs.values()):
-            error = (excitation.y[:, j] - y[:, j])[np.isfinite(excitation.y[:, j])]
-            if len(error):
-                spread = np.ptp(excitation.y[np.isfinite(excitation.y[:, j]), j])
-                rms = float(np.sqrt(np.mean(error**2)))
-                grid.add_row(
-                    o.name,
-                    str(len(error)),
-                    f"{rms:.4g} {o.unit or ''}",
-                    f"{np.max(np.abs(error)):.4g}",
-                    f"{100 * rms / spread:.2f} %" if spread > 0 else "",
-                )
-            else:
-                grid.add_row(o.name, "0", "not measured", "", "")
-        Console().print(grid)
+        title = f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run")
+        measured = bool(np.isfinite(excitation.y).any())
+        Console().print(_compared(plant, title, excitation, y) if measured else _courses(plant, title, y))
     for file, write in ((args.out, _write), (args.plot, _plot)):
         for table, excitation, x, y in runs if file else ():
             name = Path(file) if len(runs) == 1 else Path(file).with_stem(f"{Path(file).stem}_{table.name}")
             write(name, model, table, excitation, x, y)
             print(name)
     return 0
+
+
+def _initial(plant: Plant, args: argparse.Namespace) -> Mapping[str, float] | str | None:
+    """Return the option --initial: values by node, "steady", or the last state of a recording."""
+    if args.initial is None or args.initial == "steady":
+        return None if args.initial is None else "steady"
+    if "=" not in args.initial or Path(args.initial).exists():
+        (table,) = _read(plant, [args.initial], args)
+        state = last_state(plant, table)
+        print(f"start: {', '.join(f'{n} = {v:.5g}' for n, v in state.items())} (the end of {args.initial})")
+        return state
+    values = {}
+    for part in args.initial.split(","):
+        node, _, text = (x.strip() for x in part.partition("="))
+        try:
+            values[node] = float(text)
+        except ValueError:
+            raise InputError(
+                f"--initial {part}: NODE=VALUE, such as winding=22, 'steady' or a recording was expected"
+            ) from None
+    return values
+
+
+def _compared(plant: Plant, title: str, excitation: Excitation, y: np.ndarray) -> Grid:
+    """Return the table of errors by output."""
+    grid = Grid(title=title, title_justify="left")
+    for head in ("output", "samples", "rms error", "largest", "share of the range"):
+        grid.add_column(head, justify="left" if head == "output" else "right")
+    for j, o in enumerate(plant.outputs.values()):
+        error = (excitation.y[:, j] - y[:, j])[np.isfinite(excitation.y[:, j])]
+        if len(error):
+            spread = np.ptp(excitation.y[np.isfinite(excitation.y[:, j]), j])
+            rms = float(np.sqrt(np.mean(error**2)))
+            grid.add_row(
+                o.name,
+                str(len(error)),
+                f"{rms:.4g} {o.unit or ''}",
+                f"{np.max(np.abs(error)):.4g}",
+                f"{100 * rms / spread:.2f} %" if spread > 0 else "",
+            )
+        else:
+            grid.add_row(o.name, "0", "not measured", "", "")
+    return grid
+
+
+def _courses(plant: Plant, title: str, y: np.ndarray) -> Grid:
+    """Return the table of outputs that nothing measured: their start, end and range."""
+    grid = Grid(title=title, title_justify="left")
+    for head in ("output", "start", "end", "lowest", "highest"):
+        grid.add_column(head, justify="left" if head == "output" else "right")
+    for o, v in zip(plant.outputs.values(), y.T, strict=True):
+        grid.add_row(o.name, *(f"{x:.5g} {o.unit or ''}" for x in (v[0], v[-1], v.min(), v.max())))
+    return grid
 
 
 def _read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
@@ -112,72 +148,6 @@ def _read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[
         for note in table.notes:
             print(f"note: {table.path}: {note}", file=sys.stderr)
     return tables
-
-
-def _all_uncertain(plant: Plant) -> Plant:
-    nodes = {
-        n.name: dataclasses.replace(n, initial_sigma=n.initial_sigma or 1.0) for n in plant.nodes.values()
-    }
-    return dataclasses.replace(plant, nodes=nodes)
-
-
-def ahead(model: Model, excitation: Excitation, horizon_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Predict states (N, nx) and outputs (N, ny) in blocks of `horizon_s`.
-
-    An extended Kalman filter estimates the states at the start of each block from the data before it. So a
-    sample is predicted from data up to `horizon_s` older. The model must have every state uncertain and no
-    active parameter.
-    """
-    if not model.states:
-        run = model.run(excitation)
-        return run.x, run.y
-    if excitation.scale is None:
-        model.prepare(excitation)
-    p = model.vector(None, excitation.name)
-    noise = np.array(
-        [
-            np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5)
-            or 1e-3 * np.nanstd(excitation.y[:, j])
-            or 1e-9
-            for j, o in enumerate(model.plant.outputs.values())
-        ]
-    )
-    scale = np.asarray(excitation.scale)
-    x, y = (
-        np.full((len(excitation.t), len(model.states)), np.nan),
-        np.full((len(excitation.t), len(model.outputs)), np.nan),
-    )
-    state, _ = model.start(excitation, p)
-    root = np.array([n.initial_sigma or 1.0 for n in model.plant.nodes.values()])
-    information = np.diag(1 / np.minimum(root, np.maximum(scale, 1e-12)) ** 2)
-    begin = 0
-    while begin < len(excitation.t) - 1:
-        stop = min(
-            max(int(np.searchsorted(excitation.t, excitation.t[begin] + horizon_s, side="right")), begin + 2),
-            len(excitation.t),
-        )
-        block = excitation.part(begin, stop)
-        base, _ = model.start(block, p)
-        run = model.run(block, p, state - base, sensitivities=True)
-        assert run.dx is not None and run.dy is not None
-        new = slice(1 if begin else 0, None)  # the first sample belongs to the block before
-        x[begin:stop][new], y[begin:stop][new] = run.x[new], run.y[new]
-        recent = np.exp(-(block.t[-1] - block.t) / (2 * RECENT * max(horizon_s, block.t[-1] - block.t[0])))
-        matrix, gradient = information.copy(), np.zeros(len(state))
-        for j in range(len(model.outputs)):
-            e = block.y[:, j] - run.y[:, j]
-            seen = np.isfinite(e)
-            seen[0] &= begin == 0
-            e = e[seen] / noise[j] * recent[seen]
-            h = run.dy[seen, j] / noise[j] * recent[seen, None]
-            matrix += h.T @ h
-            gradient += h.T @ e
-        state = state + np.linalg.solve(matrix, gradient)
-        end = model.run(block, p, state - base)
-        spread = run.dx[-1] @ np.linalg.solve(matrix, run.dx[-1].T) + np.diag((RENEWAL * scale) ** 2)
-        information = np.linalg.inv((spread + spread.T) / 2)
-        state, begin = end.x[-1], stop - 1
-    return x, y
 
 
 def _write(

@@ -36,7 +36,8 @@ class Excitation:
     - `u` (N, inputs): gaps filled, held or linear as the input
     - `y` (N, outputs): measured, NaN where missing
     - `first`: first recorded value of each input and output
-    - `rtol`: local error a step of a run, as a share of each state's range"""
+    - `rtol`: local error a step of a run, as a share of each state's range
+    - `x0` (nx,): initial states in place of the plant's; NaN: the plant's"""
 
     name: str
     t: np.ndarray
@@ -47,6 +48,7 @@ class Excitation:
     scale: np.ndarray | None = None  # (nx,) range of each state
     width: np.ndarray | None = None  # (jumps,) half width of each smoothed jump
     rtol: float = RTOL
+    x0: np.ndarray | None = None
 
     def part(self, start: int, stop: int) -> Excitation:
         """Return the samples start..stop-1 (scales kept). Time still counts from the recording's start."""
@@ -226,7 +228,13 @@ class Model:
                 )
             return excitation.first[key]
 
-        x0 = np.array([float(ex.evaluate(e, values, first)) for e in self._initial])
+        given = np.full(len(self.states), np.nan) if excitation.x0 is None else excitation.x0
+        x0 = np.array(
+            [
+                float(ex.evaluate(e, values, first)) if np.isnan(x) else x
+                for e, x in zip(self._initial, given, strict=True)
+            ]
+        )
         s0 = np.zeros((len(self.states), len(self.unknowns)))
         for i, e in enumerate(self._initial):
             used = ex.names(e)
