@@ -72,7 +72,7 @@ def _start(plant: Plant, x0: Mapping[str, float] | Data | None) -> Mapping[str, 
         or x0 == "steady"
         or (isinstance(x0, Mapping) and all(np.ndim(v) == 0 for v in x0.values()))
     ):
-        return x0  # type: ignore[return-value]
+        return x0
     (table,) = tables_of(plant.description, x0)
     return last_state(plant.description, table)
 

@@ -150,7 +150,7 @@ def _outputs(
     for name in named:
         c = columns[name]
         if c.kind == "" and not c.unit and name not in (inputs or ()):
-            values = c and table.columns[name]
+            values = table.columns[name]
             low, high = float(values.min()), float(values.max())
             if not COLDEST <= low <= high <= HOTTEST:
                 raise _unclear(table, c, "--outputs", "degC")

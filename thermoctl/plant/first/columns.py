@@ -106,6 +106,7 @@ _SUFFIX |= {
 }
 
 
+_PLAIN = str.maketrans("øłØŁ", "olOL") | str.maketrans({"ß": "ss", "θ": " theta "})
 _SPELLED = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue"})
 
 
@@ -156,7 +157,7 @@ def words(name: str) -> list[str]:
 
 
 def _ascii(text: str) -> str:
-    text = text.translate(str.maketrans({"ß": "ss", "ø": "o", "ł": "l", "Ø": "O", "Ł": "L", "θ": " theta "}))
+    text = text.translate(_PLAIN)
     return "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
 
 

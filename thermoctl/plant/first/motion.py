@@ -33,7 +33,7 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     ids = identifiers([c.name for c in (drive, *(c for c in (place, speed) if c))])
     force, name = drive.values(table), ids[drive.name]
     mass, damping, stiffness = _sizes(
-        table.t, force, place and place.values(table), speed and speed.values(table)
+        table.t, force, place.values(table) if place else None, speed.values(table) if speed else None
     )
     by_force = drive.kind in ("force", "torque")
     margin = MARGIN * (1.0 if by_force else UNKNOWN_SCALE)
