@@ -8,11 +8,11 @@
 #endif
 enum { POWER, AIR, C, G, T, DT, READING, N };
 enum { FRESH, INITIAL, EVENT, CONTINUOUS };
-typedef struct { double v[N]; int mode, on; } Block;
+typedef struct { double v[N]; int mode, on, enabled, stage; } Block; /* enabled, stage: a Boolean and an integer input */
 typedef unsigned Ref;
 API const char *fmi2GetTypesPlatform(void) { return "default"; }
 API const char *fmi2GetVersion(void) { return "2.0"; }
-static void defaults(Block *b) { double v[N] = {0, 22, 100, 0.2, 22, 0, 22}; memcpy(b->v, v, sizeof v); b->mode = FRESH; b->on = 1; }
+static void defaults(Block *b) { double v[N] = {0, 22, 100, 0.2, 22, 0, 22}; memcpy(b->v, v, sizeof v); b->mode = FRESH; b->on = b->enabled = b->stage = 1; }
 API void *fmi2Instantiate(const char *a, int b, const char *c, const char *d, const void *e, int f, int g) {
   Block *m = calloc(1, sizeof *m); defaults(m); return m;
 }
@@ -35,7 +35,7 @@ API int fmi2GetNominalsOfContinuousStates(void *v, double *x, size_t n) { x[0] =
 API int fmi2GetEventIndicators(void *v, double *z, size_t n) { z[0] = ((Block *)v)->v[T] - 60; return 0; }
 static void update(Block *b) {
   double *v = b->v;
-  v[DT] = ((b->on ? v[POWER] : 0) - v[G] * (v[T] - v[AIR])) / v[C]; v[READING] = v[T] + 0.01 * v[POWER];
+  v[DT] = ((b->on && b->enabled ? b->stage * v[POWER] : 0) - v[G] * (v[T] - v[AIR])) / v[C]; v[READING] = v[T] + 0.01 * v[POWER];
 }
 API int fmi2GetDerivatives(void *v, double *x, size_t n) { update(v); x[0] = ((Block *)v)->v[DT]; return 0; }
 API int fmi2SetReal(void *v, const Ref *r, size_t n, const double *x) {
@@ -61,7 +61,11 @@ API int fmi2DoStep(void *v, double t, double h, int n) { /* as co-simulation: re
   for (int k = 0; k < 100; k++) update(b), b->v[T] += h / 100 * b->v[DT];
   return 0;
 }
+API int fmi2GetBoolean(void *v, const Ref *r, size_t n, int *x) { x[0] = ((Block *)v)->enabled; return 0; }
+API int fmi2SetBoolean(void *v, const Ref *r, size_t n, const int *x) { Block *b = v; b->enabled = x[0]; return b->mode == CONTINUOUS ? 3 : 0; }
+API int fmi2GetInteger(void *v, const Ref *r, size_t n, int *x) { x[0] = ((Block *)v)->stage; return 0; }
+API int fmi2SetInteger(void *v, const Ref *r, size_t n, const int *x) { Block *b = v; b->stage = x[0]; return b->mode == CONTINUOUS ? 3 : 0; }
 #define UNUSED(name) API int fmi2##name(void *b) { return 3; }
-UNUSED(SetDebugLogging) UNUSED(GetInteger) UNUSED(GetBoolean) UNUSED(GetString) UNUSED(SetInteger) UNUSED(SetBoolean) UNUSED(SetString)
+UNUSED(SetDebugLogging) UNUSED(GetString) UNUSED(SetString)
 UNUSED(CancelStep) UNUSED(GetRealOutputDerivatives) UNUSED(SetRealInputDerivatives) UNUSED(GetStatus) UNUSED(GetRealStatus) UNUSED(GetIntegerStatus) UNUSED(GetBooleanStatus) UNUSED(GetStringStatus)
 UNUSED(GetFMUstate) UNUSED(SetFMUstate) UNUSED(FreeFMUstate) UNUSED(SerializedFMUstateSize) UNUSED(SerializeFMUstate) UNUSED(DeSerializeFMUstate)

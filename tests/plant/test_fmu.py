@@ -74,6 +74,73 @@ def block(folder: Path, exact: bool = True, *options: str) -> Path:
     return path
 
 
+SWITCHES = """<ScalarVariable name="on" valueReference="0" causality="input" variability="discrete"><Boolean start="true"/></ScalarVariable>
+    <ScalarVariable name="stage" valueReference="1" causality="input" variability="discrete"><Integer start="1"/></ScalarVariable>
+  </ModelVariables>"""
+
+
+def switched(folder: Path, name: str, interface: str, content: str = "binaries/linux64/block.so") -> Path:
+    """The FMU of fmu2_block.c with a Boolean and an integer input; `content`: its library or its source."""
+    path, made, source = folder / name, folder / "block.so", Path(__file__).with_name("fmu2_block.c")
+    subprocess.run(["cc", "-w", "-shared", "-fPIC", "-o", made, source], check=True)
+    text = DESCRIPTION.format(exact="true").replace('Indicators="1"', 'Indicators="0"')
+    with zipfile.ZipFile(path, "w") as fmu:
+        fmu.writestr(
+            "modelDescription.xml",
+            EXCHANGE.sub(interface.encode(), text.encode()).replace(b"</ModelVariables>", SWITCHES.encode()),
+        )
+        fmu.write(source if content.startswith("sources") else made, content)
+    return path
+
+
+def switched_run(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Its output, and the same by hand: the heater works while `on`, in the given stage."""
+    t = np.arange(0.0, 60.0, 0.5)
+    on, stage = (t < 40).astype(float), np.where(t < 20, 1.0, 2.0)
+    columns = {"heater.P": np.full(len(t), 4.0), "air": np.full(len(t), 22.0), "on": on, "stage": stage}
+    theirs = compile_plant(plant).simulate(Table("x", "x", t, columns)).y[:, 0]
+    warm = [22.0]
+    for k in range(len(t) - 1):
+        rest, end = 4 * on[k] * stage[k] / 0.2, np.exp(-0.2 / 100 * 0.5)
+        warm.append(22 + rest + (warm[-1] - 22 - rest) * end)
+    return theirs, np.array(warm) + 0.01 * 4
+
+
+@pytest.mark.parametrize(
+    "interface", ["<ModelExchange modelIdentifier='block'/>", "<CoSimulation modelIdentifier='block'/>"]
+)
+def test_boolean_and_integer_inputs_are_driven(tmp_path, interface):
+    theirs, ours = switched_run(load(switched(tmp_path, "b.FMU", interface)))
+    assert np.max(np.abs(theirs - ours)) < 2e-3 < 0.1 * np.ptp(ours)
+
+
+def test_an_fmu_of_sources_is_compiled(tmp_path):
+    path = switched(tmp_path, "s.fmu", "<ModelExchange modelIdentifier='block'/>", "sources/block.c")
+    theirs, ours = switched_run(load(path))
+    assert np.max(np.abs(theirs - ours)) < 2e-3
+    other = switched(
+        tmp_path, "w.fmu", "<ModelExchange modelIdentifier='block'/>", "binaries/win64/block.dll"
+    )
+    with pytest.raises(
+        InputError, match=r"w.fmu: no library for this machine \(.*it has win64\) and no C sources"
+    ):
+        load(other)
+
+
+def test_a_refused_step_is_named_with_its_time(tmp_path, capsys):
+    fixed = '<CoSimulation modelIdentifier="block" canHandleVariableCommunicationStepSize="false"/>'
+    path = switched(tmp_path, "c.fmu", fixed)
+    rows = "\n".join(
+        f"{t},{101 if t >= 20 else 5},22,1,1,25" for t in range(0, 60, 2)
+    )  # it refuses above 100 W
+    (tmp_path / "r.csv").write_text(f"t,heater.P,air,on,stage,reading\n{rows}\n")
+    assert cli.main(["simulate", "--plant", str(path), str(tmp_path / "r.csv")]) == 2
+    error = capsys.readouterr().err
+    assert (
+        "c.fmu refuses the step from t = " in error and " s of 2 s: it takes steps of one size only" in error
+    )
+
+
 def test_the_same_outputs_and_sensitivities(heater):
     plant, back, table = heater
     ours, theirs = (compile_plant(p).simulate(table, sensitivities=True) for p in (plant, back))
@@ -190,7 +257,7 @@ def test_what_is_no_usable_fmu_is_said(heater, tmp_path):
     path = block(tmp_path)
     with pytest.raises(InputError, match="of model exchange or of co-simulation was expected"):
         as_cosimulation(path, tmp_path / "neither.fmu")
-    with pytest.raises(InputError, match="no state, real input or parameter 'Q'"):
+    with pytest.raises(InputError, match="no state, input or parameter 'Q'"):
         opened(str(path)).argument("Q")
     with pytest.raises(InputError, match="no derivative and no output 'T'"):
         opened(str(path)).result("T")

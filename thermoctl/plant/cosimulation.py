@@ -37,6 +37,7 @@ References = ctypes.Array[ctypes.c_uint]
 class Layout:
     """References of an FMU's variables; start values and sizes of its inputs, then parameters.
 
+    `types`: of the inputs, as FMI names them. `refused` is called with the time and length of a refused step.
     A row of arguments: time, inputs, held inputs, parameters. NaN stands for the start value."""
 
     version: int
@@ -45,6 +46,8 @@ class Layout:
     outputs: References
     start: np.ndarray
     scale: np.ndarray
+    types: tuple[str, ...] = ()
+    refused: Callable[[float, float], None] = lambda t, seconds: None
 
     @property
     def fixed(self) -> int:
@@ -77,6 +80,22 @@ class Instance:
     def put(self, references: References, values: np.ndarray) -> None:
         """Set variables. Raises OSError."""
         self._call(self._put, references, values)
+
+    def drive(self, layout: Layout, values: np.ndarray) -> None:
+        """Set the inputs, each by the function of its type. Raises OSError, and what FMPy raises."""
+        if not set(layout.types) - {"Real", "Float64"}:
+            self.put(layout.inputs, values)
+            return
+        for reference, kind, value in zip(layout.inputs, layout.types, values, strict=True):
+            number = float(value)
+            one = (
+                number
+                if kind in ("Real", "Float64")
+                else number >= 0.5
+                if kind == "Boolean"
+                else round(number)
+            )
+            getattr(self.fmu, f"set{kind}")([reference], [one])
 
     def get(self, references: References) -> np.ndarray:
         """Return variables. Raises OSError."""
@@ -120,9 +139,9 @@ class Run:
             if self._failed:
                 return np.full(len(layout.outputs), np.nan)
             if t > self._t and not begins:
-                at.put(layout.inputs, self._before * self._inputs + (1 - self._before) * inputs)
-                at.step(self._t, t - self._t)
-            at.put(layout.inputs, inputs)
+                at.drive(layout, self._before * self._inputs + (1 - self._before) * inputs)
+                self._step(at, t)
+            at.drive(layout, inputs)
             self._inputs = inputs
             return at.get(layout.outputs)
         except Exception:  # FMPy raises bare Exceptions
@@ -130,6 +149,14 @@ class Run:
             return np.full(len(layout.outputs), np.nan)
         finally:
             self._t, self._known = t, parameters
+
+    def _step(self, at: Instance, t: float) -> None:
+        """Advance to t. Raises OSError, and reports the step where the FMU refuses it."""
+        try:
+            at.step(self._t, t - self._t)
+        except OSError:
+            self._layout.refused(self._t, t - self._t)
+            raise
 
     def _begin(self, t: float, row: np.ndarray) -> Instance:
         layout, n = self._layout, len(self._layout.inputs)

@@ -18,7 +18,7 @@ from thermoctl.yamlfile import InputError
 
 def load(path: str | Path, mapped: str | Path | None = None) -> Plant:
     """Read and check a plant file, or an FMU with the file that maps its variables. Raises InputError."""
-    if Path(path).suffix == ".fmu":
+    if Path(path).suffix.lower() == ".fmu":
         return _checked(plant_node(path, yamlfile.load(mapped) if mapped else None))
     if mapped:
         raise InputError(f"{path}: a map ({mapped}) goes with an FMU; a file that ends in .fmu was expected")

@@ -1,23 +1,26 @@
 /* One instance of an FMU (FMI 2 or 3, model exchange) as a function: derivatives of its states, then its outputs.
 
-   Arguments: time, the states, then real variables that may be set. An argument that is NaN keeps its value. Results and the columns
+   Arguments: time, the states, then variables that may be set: reals, and Boolean and integer inputs. An argument that is NaN keeps its value. Results and the columns
    of slopes are kept until an argument changes. A failure of the FMU gives NaN, and the integrator takes a smaller step. */
 #include <math.h>
 #include <pthread.h>
 #include <stdbool.h>
+#include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
 typedef unsigned Ref;
 enum { TIME, STATE, CONTINUOUS, DISCRETE, FIXED }; /* kinds of arguments: where FMI allows them to be set */
-enum { SET_TIME, SET_STATES, GET_DERIVATIVES, SET, GET, TO_EVENTS, UPDATE, TO_CONTINUOUS, RESET, SETUP, TO_INITIAL, FROM_INITIAL, SLOPE, FUNCTIONS };
+enum { REAL, BOOLEAN, INTEGER, INTEGER64 }; /* types of arguments; FMI 2 has 32 bits for the second and third */
+enum { SET_TIME, SET_STATES, GET_DERIVATIVES, SET, GET, TO_EVENTS, UPDATE, TO_CONTINUOUS, RESET, SETUP, TO_INITIAL, FROM_INITIAL, SLOPE, SET_BOOLEAN, SET_INTEGER,
+       SET_INTEGER64, FUNCTIONS };
 enum { ERROR = 3, ROUNDS = 100 };
 
 typedef struct {
   void *instance, *f[FUNCTIONS];
   int version, nx, na, nr, events, exact; /* events: relations change at events only; exact: directional derivatives are given */
   Ref *argument, *result;
-  int *kind;
+  int *kind, *type;
   double *scale, *a, *r, *slope, start;
   char *known, *told; /* known: r, then each column of slope; told: arguments that were ever given */
   pthread_mutex_t lock;
@@ -26,7 +29,22 @@ typedef struct {
 #define CALL(k, types, ...) (((int (*)types)m->f[k])(m->instance, __VA_ARGS__) >= ERROR)
 #define CALL0(k) (((int (*)(void *))m->f[k])(m->instance) >= ERROR)
 
-static int set(Fmu *m, Ref ref, double value) {
+static int set(Fmu *m, int j) {
+  Ref ref = m->argument[j];
+  double value = m->a[j];
+  if (m->type[j] == BOOLEAN) {
+    int flag = value >= 0.5;
+    bool one = flag;
+    if (m->version == 2) return CALL(SET_BOOLEAN, (void *, const Ref *, size_t, const int *), &ref, 1, &flag);
+    return CALL(SET_BOOLEAN, (void *, const Ref *, size_t, const bool *, size_t), &ref, 1, &one, 1);
+  }
+  if (m->type[j]) {
+    int64_t wide = llround(value);
+    int32_t whole = (int32_t)wide;
+    if (m->version == 2) return CALL(SET_INTEGER, (void *, const Ref *, size_t, const int *), &ref, 1, &whole);
+    if (m->type[j] == INTEGER) return CALL(SET_INTEGER, (void *, const Ref *, size_t, const int32_t *, size_t), &ref, 1, &whole, 1);
+    return CALL(SET_INTEGER64, (void *, const Ref *, size_t, const int64_t *, size_t), &ref, 1, &wide, 1);
+  }
   if (m->version == 2) return CALL(SET, (void *, const Ref *, size_t, const double *), &ref, 1, &value);
   return CALL(SET, (void *, const Ref *, size_t, const double *, size_t), &ref, 1, &value, 1);
 }
@@ -51,7 +69,7 @@ static int settle(Fmu *m) {
 
 static int set_kind(Fmu *m, const char *changed, int kind) {
   for (int j = 1 + m->nx; j < m->na; j++)
-    if (m->kind[j] == kind && (changed ? changed[j] : m->told[j]) && set(m, m->argument[j], m->a[j])) return 1;
+    if (m->kind[j] == kind && (changed ? changed[j] : m->told[j]) && set(m, j)) return 1;
   return 0;
 }
 
@@ -107,6 +125,10 @@ static void take(Fmu *m, const double *a) {
 static void column(Fmu *m, int j) {
   double *s = m->slope + (size_t)j * m->nr, one = 1;
   m->known[1 + j] = 1;
+  if (m->type[j] != REAL) {
+    memset(s, 0, m->nr * sizeof *s);
+    return;
+  }
   if (m->exact && (m->kind[j] == STATE || m->kind[j] == CONTINUOUS)) {
     int failed = m->version == 2
       ? CALL(SLOPE, (void *, const Ref *, size_t, const Ref *, size_t, const double *, double *), m->result, m->nr, m->argument + j, 1, &one, s)
@@ -159,18 +181,18 @@ static void *copy(const void *from, size_t size) {
 }
 
 /* sizes: version, nx, na, nr, events, exact. `a` (na,): the values that the instance has now. */
-void *fmu_make(void *instance, void *const *functions, const int *sizes, const Ref *argument, const int *kind, const double *scale,
+void *fmu_make(void *instance, void *const *functions, const int *sizes, const Ref *argument, const int *kind, const int *type, const double *scale,
                const Ref *result, const double *a) {
   Fmu *m = calloc(1, sizeof *m);
   if (!m) return NULL;
   m->instance = instance;
   memcpy(m->f, functions, sizeof m->f);
   m->version = sizes[0], m->nx = sizes[1], m->na = sizes[2], m->nr = sizes[3], m->events = sizes[4], m->exact = sizes[5];
-  m->argument = copy(argument, m->na * sizeof *argument), m->kind = copy(kind, m->na * sizeof *kind);
+  m->argument = copy(argument, m->na * sizeof *argument), m->kind = copy(kind, m->na * sizeof *kind), m->type = copy(type, m->na * sizeof *type);
   m->scale = copy(scale, m->na * sizeof *scale), m->a = copy(a, m->na * sizeof *a);
   m->result = copy(result, m->nr * sizeof *result), m->r = calloc(m->nr + 1, sizeof *m->r);
   m->slope = calloc((size_t)m->na * m->nr + 1, sizeof *m->slope);
   m->known = calloc(m->na + 1, 1), m->told = calloc(m->na + 1, 1);
   pthread_mutex_init(&m->lock, NULL);
-  return m->argument && m->kind && m->scale && m->a && m->result && m->r && m->slope && m->known && m->told ? m : NULL;
+  return m->argument && m->kind && m->type && m->scale && m->a && m->result && m->r && m->slope && m->known && m->told ? m : NULL;
 }

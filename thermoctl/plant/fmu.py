@@ -18,6 +18,7 @@ import atexit
 import ctypes
 import hashlib
 import shutil
+import subprocess
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoctl.extras import load
-from thermoctl.plant.build import library
+from thermoctl.plant.build import compiler, library
 from thermoctl.plant.cosimulation import Course, Layout, References
 from thermoctl.yamlfile import InputError, suggest
 
@@ -40,16 +41,24 @@ _TIME, _STATE, _CONTINUOUS, _DISCRETE, _FIXED = range(5)  # as in fmu.h
 _FUNCTIONS = {  # in the order of fmu.h
     2: "SetTime SetContinuousStates GetDerivatives SetReal GetReal EnterEventMode NewDiscreteStates "
     "EnterContinuousTimeMode Reset SetupExperiment EnterInitializationMode ExitInitializationMode "
-    "GetDirectionalDerivative",
+    "GetDirectionalDerivative SetBoolean SetInteger SetInteger",
     3: "SetTime SetContinuousStates GetContinuousStateDerivatives SetFloat64 GetFloat64 EnterEventMode "
     "UpdateDiscreteStates EnterContinuousTimeMode Reset Reset EnterInitializationMode ExitInitializationMode "
-    "GetDirectionalDerivative",
+    "GetDirectionalDerivative SetBoolean SetInt32 SetInt64",
+}
+_TYPES = {  # of the variables that a recording may drive: as in fmu.h; the getter of FMPy
+    "Real": (0, "getReal"),
+    "Float64": (0, "getFloat64"),
+    "Boolean": (1, "getBoolean"),
+    "Integer": (2, "getInteger"),
+    "Int32": (2, "getInt32"),
+    "Int64": (3, "getInt64"),
 }
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A real variable of an FMU. `start`: its value after initialization; `range` and `unit` if declared."""
+    """A variable of an FMU. `start`: its value after initialization; `range` and `unit` if declared."""
 
     name: str
     unit: str | None
@@ -76,13 +85,13 @@ class Fmu:
         states = [v.derivative for v in derivatives]
         variables = [v for v in d.modelVariables if v.type in ("Real", "Float64") and not v.dimensions]
         settable = [v for v in variables if v not in states]
-        inputs = [v for v in settable if v.causality == "input"]
+        inputs = _inputs(d)
         parameters = [v for v in settable if v.causality == "parameter" and v.variability != "constant"]
         results = [*derivatives, *(u.variable for u in d.outputs if u.variable in variables)]
         self._kinds = [
             _TIME,
             *[_STATE] * len(states),
-            *(_DISCRETE if v.variability == "discrete" else _CONTINUOUS for v in inputs),
+            *(_DISCRETE if _discrete(v) else _CONTINUOUS for v in inputs),
             *(_FIXED if v.variability == "fixed" else _DISCRETE for v in parameters),
         ]
         arguments = [*states, *inputs, *parameters]
@@ -106,8 +115,10 @@ class Fmu:
         self._make(arguments, results, now)
 
     def _values(self, variables: Sequence[ModelVariable]) -> dict[str, float]:
-        get = self._instance.getFloat64 if self._version == 3 else self._instance.getReal
-        return dict(zip([v.name for v in variables], get([v.valueReference for v in variables]), strict=True))
+        return {
+            v.name: float(getattr(self._instance, _TYPES[v.type][1])([v.valueReference])[0])
+            for v in variables
+        }
 
     @property
     def _version(self) -> int:
@@ -134,13 +145,14 @@ class Fmu:
             int(d.numberOfEventIndicators > 0),
             int(bool(exact)),
         ]
-        scale = [1.0, *(float(v.nominal or 0) or _size(now[v.name]) for v in arguments)]
+        scale = [1.0, *(float(getattr(v, "nominal", 0) or 0) or _size(now[v.name]) for v in arguments)]
         self._handle = self._library.fmu_make(
             self._instance.component,
             (ctypes.c_void_p * len(functions))(*functions),
             (ctypes.c_int * 6)(*sizes),
             (ctypes.c_uint * (1 + len(arguments)))(0, *(v.valueReference for v in arguments)),
             (ctypes.c_int * (1 + len(arguments)))(*self._kinds),
+            (ctypes.c_int * (1 + len(arguments)))(0, *(_TYPES[v.type][0] for v in arguments)),
             (ctypes.c_double * len(scale))(*scale),
             (ctypes.c_uint * (len(results) + 1))(*(v.valueReference for v in results)),
             (ctypes.c_double * len(scale))(0.0, *(now[v.name] for v in arguments)),
@@ -177,7 +189,7 @@ class Fmu:
         """Return the place of an argument. Raises InputError for another name."""
         if name not in self.arguments:
             raise InputError(
-                f"{self.path}: no state, real input or parameter '{name}'{suggest(name, self.arguments)}"
+                f"{self.path}: no state, input or parameter '{name}'{suggest(name, self.arguments)}"
             )
         return self.arguments[name]
 
@@ -222,13 +234,15 @@ class Cosimulation(Fmu):
     """An opened FMU that is for co-simulation only: no states, and outputs of runs."""
 
     runs = True
+    refusal = ""
+    """The first step that the FMU refused, for people."""
 
     def __init__(self, path: Path, d: ModelDescription):
         self.path = path
         self.digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        self._description, self._folder = d, _extracted(path)
+        self._description, self._folder = d, _extracted(path, d)
         variables = [v for v in d.modelVariables if v.type in ("Real", "Float64") and not v.dimensions]
-        inputs = [v for v in variables if v.causality == "input"]
+        inputs = _inputs(d)
         parameters = [v for v in variables if v.causality == "parameter" and v.variability != "constant"]
         unknowns = [u for u in d.outputs if u.variable in variables]
         settable = [*inputs, *parameters]
@@ -247,7 +261,9 @@ class Cosimulation(Fmu):
             _references(parameters),
             _references([u.variable for u in unknowns]),
             np.array([now[v.name] for v in settable]),
-            np.array([float(v.nominal or 0) or _size(now[v.name]) for v in settable]),
+            np.array([float(getattr(v, "nominal", 0) or 0) or _size(now[v.name]) for v in settable]),
+            tuple(v.type for v in inputs),
+            self._refused,
         )
         self.inputs, self.parameters = (
             {v.name: _variable(v, now) for v in group} for group in (inputs, parameters)
@@ -263,6 +279,21 @@ class Cosimulation(Fmu):
 
     def _made(self) -> Any:
         return _instantiated(self.path, self._description, self._folder)
+
+    def _refused(self, t: float, seconds: float) -> None:
+        """Keep the first step that the FMU refuses, and what to do about it."""
+        if self.refusal:
+            return
+        self.refusal = f"{self.path.name} refuses the step from t = {t:g} s of {seconds:g} s"
+        only = self._description.coSimulation
+        if only is not None and not only.canHandleVariableCommunicationStepSize:
+            own = getattr(only, "fixedInternalStepSize", None) or getattr(
+                self._description.defaultExperiment, "stepSize", None
+            )
+            self.refusal += (
+                f": it takes steps of one size only ({f'{float(own):g} s' if own else 'which its description does not say'}); "
+                "resample the recording to it, or export the FMU for model exchange"
+            )
 
     def course(self) -> Course:
         """Return a new course."""
@@ -290,6 +321,15 @@ class Cosimulation(Fmu):
         return np.array(out).reshape(shaped[0].shape)[()]
 
 
+def _inputs(d: ModelDescription) -> list[ModelVariable]:
+    """Return the inputs that a recording can drive: real, Boolean and integer scalars."""
+    return [v for v in d.modelVariables if v.causality == "input" and v.type in _TYPES and not v.dimensions]
+
+
+def _discrete(v: ModelVariable) -> bool:
+    return v.variability == "discrete" or _TYPES[v.type][0] > 0
+
+
 def _references(variables: Sequence[ModelVariable]) -> References:
     return (ctypes.c_uint * len(variables))(*(v.valueReference for v in variables))
 
@@ -298,7 +338,7 @@ def _variable(v: ModelVariable, now: Mapping[str, float]) -> Variable:
     limits = (float(v.min), float(v.max)) if v.min is not None and v.max is not None else None
     value = now.get(v.name, 0.0)
     unit = v.unit or (v.declaredType.unit if v.declaredType else None)
-    return Variable(v.name, unit, value, limits, v.variability == "discrete")
+    return Variable(v.name, unit, value, limits, v.causality == "input" and _discrete(v))
 
 
 def _size(value: float) -> float:
@@ -340,7 +380,7 @@ def _description(path: Path) -> ModelDescription:
     return found
 
 
-def _extracted(path: Path) -> str:
+def _extracted(path: Path, d: ModelDescription) -> str:
     import fmpy
 
     folder = tempfile.mkdtemp(prefix="thermoctl-fmu")
@@ -349,7 +389,41 @@ def _extracted(path: Path) -> str:
         fmpy.extract(str(path), folder)
     except Exception as e:
         raise InputError(f"{path}: cannot be unpacked: {' '.join(str(e).split())[:300]}") from None
+    _compiled(path, d, Path(folder))
     return folder
+
+
+def _compiled(path: Path, d: ModelDescription, folder: Path) -> None:
+    """Compile an unpacked FMU's C sources where it has no library for this machine. Raises InputError."""
+    import fmpy
+
+    interface = d.modelExchange or d.coSimulation
+    name = interface.modelIdentifier
+    names = (fmpy.platform, fmpy.platform_tuple)  # of FMI 2 and FMI 3
+    if any((folder / "binaries" / n / f"{name}{fmpy.sharedLibraryExtension}").exists() for n in names):
+        return
+    there = sorted(p.name for p in (folder / "binaries").glob("*")) or ["none"]
+    said = f"{path}: no library for this machine ({', '.join(names)}; it has {', '.join(there)})"
+    sources = folder / "sources"
+    sets = [s for c in d.buildConfigurations if c.modelIdentifier == name for s in c.sourceFileSets]
+    listed = [f for s in sets for f in s.sourceFiles]
+    files = [sources / f for f in listed] or sorted(sources.glob("*.c"))
+    if not files or not all(f.is_file() for f in files):
+        raise InputError(f"{said} and no C sources; export it for this machine, or with its sources")
+    target = folder / "binaries" / names[d.fmiVersion[0] == "3"] / f"{name}{fmpy.sharedLibraryExtension}"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    headers = [sources, *{f.parent for f in files}, Path(fmpy.__file__).parent / "c-code"]
+    prefix = (
+        f"FMI{d.fmiVersion[0]}_OVERRIDE_FUNCTION_PREFIX"
+        if d.fmiVersion[0] == "3"
+        else "FMI2_OVERRIDE_FUNCTION_PREFIX"
+    )
+    command = [*compiler(), "-O2", "-fPIC", "-shared", "-w", f"-D{prefix}", *(f"-I{h}" for h in headers)]
+    done = subprocess.run(
+        [*command, *map(str, files), "-o", str(target), "-lm"], capture_output=True, text=True
+    )
+    if done.returncode:
+        raise InputError(f"{said}, and its C sources do not compile: {' '.join(done.stderr.split())[:400]}")
 
 
 def _instantiated(path: Path, d: ModelDescription, folder: str) -> Any:
@@ -376,7 +450,7 @@ def _instantiated(path: Path, d: ModelDescription, folder: str) -> Any:
 
 
 def _instance(path: Path, d: ModelDescription) -> Any:
-    found = _instantiated(path, d, _extracted(path))
+    found = _instantiated(path, d, _extracted(path, d))
     try:
         if d.fmiVersion[0] == "2":
             found.setupExperiment(startTime=0.0)
@@ -396,7 +470,7 @@ def _instance(path: Path, d: ModelDescription) -> Any:
 def _shim() -> ctypes.CDLL:
     shim = library(Path(__file__).with_name("fmu.h").read_text())
     p, i = ctypes.c_void_p, ctypes.c_int
-    shim.fmu_make.argtypes, shim.fmu_make.restype = [p] * 8, p
+    shim.fmu_make.argtypes, shim.fmu_make.restype = [p] * 9, p
     shim.fmu_rows.argtypes, shim.fmu_rows.restype = [p, i, i, i, p, p], None
     return shim
 
