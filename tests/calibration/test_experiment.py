@@ -141,12 +141,14 @@ def test_experiment_refuses_what_the_rig_may_not_do(quick, capsys):
 
 
 def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out(quick, capsys):
-    """The margin that the shipped gains have on the simulated rig is where it becomes unstable; --write takes no unstable gains."""
+    """The margin measured with the shipped gains is where the loop becomes unstable; --write proves each step and takes no unstable gains."""
     assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "imc"]) == 0
     said = capsys.readouterr().out
     gain = float(re.search(r"present: gain margin ([\d.]+)", said)[1])
     settings = load_settings("rig.yaml")
     assert f"kp: {settings.control.kp:g}" in (quick / "rig.yaml").read_text() and settings.control.kp != 0.01
+    proven = re.findall(r"step (\d) of (\d) .*phase margin (\d+) \+- \d deg measured", said)
+    assert [int(k) for k, _, _ in proven] == list(range(1, int(proven[0][1]) + 1)) and int(proven[-1][2]) >= 45
 
     def trips(kp):
         c = dataclasses.replace(settings.control, kp=kp, ti_s=0.004, td_s=0.001)
@@ -157,11 +159,12 @@ def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out
         simulation.close()
         return state != 3
 
-    assert not trips(0.01 * gain * 0.95) and trips(0.01 * gain * 1.1)
+    assert not trips(0.01 * gain * 0.9) and trips(0.01 * gain * 1.1)
     before = (quick / "rig.yaml").read_bytes()
     assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "zn"]) == 2
     said, err = capsys.readouterr()
-    assert "UNSTABLE" in said and "not written" in err and (quick / "rig.yaml").read_bytes() == before
+    assert "UNSTABLE" in said and "not tried on the rig" in err and "not proposed" in said
+    assert (quick / "rig.yaml").read_bytes() == before
 
 
 def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypatch):

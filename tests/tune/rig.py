@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.rig.channels import AT
@@ -168,3 +169,18 @@ def settings_of(folder, truth, kp, ti_s, td_s, rate_um_s=100.0, average=1):
         )
     )
     return load_settings(path)
+
+
+class LoopRig(SimulatedRig):
+    """Such a loop as the rig of a command: each session from rest, at other instants."""
+
+    def __init__(self, settings, truth, seed=0):
+        super().__init__(settings)
+        self.truth, self.seed, self.sessions = truth, seed, 0
+        self.command_s = (
+            max(1.0, math.ceil(1.0 / (truth.command_hz * truth.period_s) - 1e-9)) * truth.period_s
+        )
+
+    def simulation(self, settings, model=None):
+        self.sessions += 1
+        return LateSimulation(self.truth, 1000 * self.seed + self.sessions, settings, model)

@@ -12,12 +12,13 @@ import numpy as np
 
 from thermoctl.calibration import chain, drive, experiment, iso230, recorded, schedules
 from thermoctl.calibration.keyboard import Keyboard
+from thermoctl.calibration.tune import TESTS
+from thermoctl.calibration.tune import tune as tune_loop
 from thermoctl.calibration.wizard import Wizard
 from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.extras import load
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
-from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 
@@ -141,37 +142,17 @@ def model(action: str, models: str | None, name: str | None) -> int:
 def tune(config: str, method: str, write: bool, yes: bool) -> int:
     """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
 
-    It writes them only on request. Returns 1 when the user answered no.
+    On request the proposal is proven on the rig, step by step, and written. Returns 1 when the user answered
+    no.
     """
     settings = load_settings(config)
-    c = settings.control
     rig = drive.rig_of(settings)
-    schedule = schedules.triangles(settings, rig.now()["compensated_um"])
-    if not drive.agreed(rig, [schedule], yes):
+    one = schedules.triangles(settings, rig.now()["compensated_um"])
+    if not drive.agreed(rig, [one] * (TESTS if write else 1), yes):
         return 1
-    rows = drive.excite(rig, schedule, Keyboard(False))
-    period, average = settings.loop.period_s, int(c.moving_average)
-    t, u, y = (rows[:, AT[n]] for n in ("t_s", "drive", "position_raw_um"))
-    plant = tuning.fit_response(t, u, y, period)
-    present = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
-    proposed = tuning.ziegler_nichols(plant) if method == "zn" else tuning.robust(plant, period, average)
-    k0, tau_d, tau_c = tuning.tangent(plant)
-    print(
-        f"response: K0 {k0:.4g} um per unit, delay {1e3 * tau_d:.3g} ms, time constant {1e3 * tau_c:.3g} ms, "
-        f"residual {plant.residual:.2g} um"
-    )
-    for g in (present, proposed):
-        m = tuning.margins(plant, g, period, average)
-        print(
-            f"{g.how}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg{'' if m.stable else ', UNSTABLE'}"
-        )
-    print(tuning.difference(present, proposed))
-    if write:
-        if not m.stable:
-            raise InputError(
-                f"{config}: not written, the proposed gains make this loop unstable; take --method imc"
-            )
-        tuning.write(Path(settings.path), proposed, settings.axis)
+    found = tune_loop(rig, method, write, Keyboard(False), lambda line: print(line, flush=True))
+    if write and found.proposed != found.present:
+        tuning.write(Path(settings.path), found.proposed, settings.axis)
         print(f"written to {settings.path}; 'thermoctl reload' applies it")
     return 0
 

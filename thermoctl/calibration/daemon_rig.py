@@ -9,7 +9,7 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from thermoctl.daemon.control_socket import Connection, ask
 from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
+from thermoctl.identify.tuning import Gains
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.make import driving_devices
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
 # after this time without a tick the loop has ended (the supervisor's STALL_S; at least protection.late_s)
@@ -47,7 +49,7 @@ class DaemonRig:
     real = True
 
     def __init__(self, settings: Settings):
-        self.settings = settings
+        self.settings, self.command_s = settings, command_period_s(settings)
         self.where = f"the daemon at {settings.socket.path}, in real time"
 
     def now(self) -> dict[str, Any]:
@@ -70,6 +72,14 @@ class DaemonRig:
             )
         return status
 
+    def gains(self) -> Gains:
+        """Return the gains in force. Raises HardwareError when the daemon does not say."""
+        with _rig_answers():
+            answer = ask(self.settings.socket.path, {"command": "gains"})
+        if not answer["ok"]:
+            raise HardwareError(answer["error"])
+        return Gains(answer["kp"], answer["ti_s"], answer["td_s"], "present")
+
     def run(
         self,
         schedule: Schedule,
@@ -80,12 +90,13 @@ class DaemonRig:
         model: CompensatorModel | None = None,
         every_s: float = EVERY_S,
         rest: bool = True,
-    ) -> Iterator[np.ndarray]:
+        gains: Gains | None = None,
+    ) -> Generator[np.ndarray, None, None]:
         """Yield the rows of a test from `at_s` of its schedule on, after those of `earlier`.
 
         It arms first, and disarms on every way out. While paused, the setpoint is held and rows continue,
         because the rig cools meanwhile. The model is fitted to the measured rows, not to the schedule.
-        `rest`: wait first until the rig is at rest. Raises Aborted when the law leaves ARMED, the daemon
+        `rest`: wait first until the rig is at rest. `gains`: tried until it disarms. Raises Aborted when the law leaves ARMED, the daemon
         ends, or the user ends the test. Raises HardwareError when the rig does not arm.
         """
         if earlier is not None:
@@ -98,6 +109,11 @@ class DaemonRig:
             if not answer["ok"]:
                 raise HardwareError(answer["error"])
             try:
+                if gains is not None:
+                    tried = {"kp": gains.kp, "ti_s": gains.ti_s, "td_s": gains.td_s}
+                    answer = daemon.ask({"command": "gains", **tried})
+                    if not answer["ok"]:
+                        raise HardwareError(answer["error"])
                 yield from self._play(daemon, shared, schedule, at_s, progress, keyboard, every_s)
             finally:
                 self._disarm(daemon, shared)
@@ -199,6 +215,22 @@ class DaemonRig:
         if np.diff(rows[:, wall]).max(initial=0.0) > GAP_S or time.time() - rows[-1, wall] > GAP_S:
             return None
         return as_table(rows, earlier.path, self.settings.row)
+
+
+def command_period_s(settings: Settings) -> float:
+    """Return the time between two commands that the rig's amplifier takes, s; a tick at least.
+
+    A tick sends the command when 1 / command_hz has passed since the last one; a slow device takes it in the
+    rounds of its poller. A CiA-402 drive takes it in every tick."""
+    period_s = settings.loop.period_s
+    found = [period_s]
+    for device in driving_devices(settings) if settings.hal.backend == "devices" else ():
+        amplifier = device.binding.profile.amplifier
+        if amplifier is None or amplifier.command is None:
+            continue
+        ticks = 1.0 / (amplifier.command_hz * period_s)
+        found.append((ticks + 1.0 if device.slow else math.ceil(ticks - 1e-9)) * period_s)
+    return max(found)
 
 
 @contextlib.contextmanager

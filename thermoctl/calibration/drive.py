@@ -8,6 +8,7 @@ process. Both raise hal.backend.HardwareError (exit status 3, one line) when the
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.daemon.control_socket import ask
 from thermoctl.identify.experiments import Aborted, Schedule
+from thermoctl.identify.tuning import Gains
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
@@ -84,11 +86,29 @@ def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     return input("type go to arm the rig and start; anything else leaves it as it is: ").strip() == "go"
 
 
-def excite(rig: DrivenRig, schedule: Schedule, keyboard: Keyboard) -> np.ndarray:
-    """Record every tick of a short schedule. Raises HardwareError when it ends early."""
+def excite(
+    rig: DrivenRig,
+    schedule: Schedule,
+    keyboard: Keyboard,
+    gains: Gains | None = None,
+    most_um: float = math.inf,
+) -> np.ndarray:
+    """Record every tick of a short schedule; `gains`: tried for as long as it lasts.
+
+    It is ended at an error of most_um, um. Raises HardwareError when it ends early."""
+    blocks = []
+    run = rig.run(schedule, lambda p: None, keyboard, every_s=0.0, rest=False, gains=gains)
     try:
-        with keyboard.listening():
-            rows = np.vstack(list(rig.run(schedule, lambda p: None, keyboard, every_s=0.0, rest=False)))
+        with keyboard.listening(), contextlib.closing(run):
+            for rows in run:
+                blocks.append(rows)
+                error_um = np.abs(rows[:, AT["reference_um"]] - rows[:, AT["compensated_um"]]).max()
+                if error_um > most_um:
+                    raise Aborted(
+                        f"the error grew to {error_um:.3g} um",
+                        float(rows[-1, AT["t_s"]] - blocks[0][0, AT["t_s"]]),
+                    )
     except Aborted as e:
         raise HardwareError(f"ended after {e.done_s:.1f} s, the amplifier is disabled: {e.reason}") from None
+    rows = np.vstack(blocks)
     return rows[rows[:, AT["state"]] == arming.ARMED]

@@ -17,7 +17,8 @@ from thermoctl.identify.experiments import Schedule
 from thermoctl.yamlfile import InputError, suggest
 
 CUTOFF_HZ = 4.3e-4  # the coil's corner: 1 / (2 pi 370 s), its time constant in test 1 of the paper
-RAMPS_S = 8 * (0.1, 0.2, 0.1, 0.3)  # 11 s: phase margins repeat within 1 degree on the simulated rig
+# 13 s: the short ramps for the frequencies above the crossover, the long ones for those below
+RAMPS_S = 6 * (0.1, 0.2, 0.1, 0.3) + 20 * (0.04, 0.06)
 TRAVEL_UM = 10.0  # longest ramp for tuning
 ROOM_C = 20.0  # coil temperature when it is not measured: that of protection.resistance_ohm
 

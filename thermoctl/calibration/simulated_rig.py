@@ -5,7 +5,7 @@ The configuration's simulated back end under the daemon's law, faster than real 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,10 @@ from thermoctl.control import arming
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.answers.snapshot import channel_states
 from thermoctl.daemon.offline.simulate import Simulation
+from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
+from thermoctl.identify.tuning import Gains
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
@@ -37,20 +39,35 @@ def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
     return dataclasses.replace(settings, compensation=compensation, protection=protection)
 
 
+def with_gains(settings: Settings, gains: Gains) -> Settings:
+    """Set other gains of the position loop."""
+    control = dataclasses.replace(settings.control, kp=gains.kp, ti_s=gains.ti_s, td_s=gains.td_s)
+    return dataclasses.replace(settings, control=control)
+
+
 class SimulatedRig:
     """The configuration's simulated back end, in this process, each test from rest."""
 
     real = False
 
     def __init__(self, settings: Settings):
-        self.settings = settings
+        self.settings, self.command_s = settings, settings.loop.period_s
         self.where = "the simulated rig, faster than real time"
+
+    def simulation(self, settings: Settings, model: CompensatorModel | None = None) -> Simulation:
+        """Make the rig of a session, at rest."""
+        return Simulation(settings, model)
+
+    def gains(self) -> Gains:
+        """Return the gains in force."""
+        c = self.settings.control
+        return Gains(c.kp, c.ti_s, c.td_s, "present")
 
     def now(self) -> dict[str, Any]:
         """Read channel states, temperatures and position once the law is READY.
 
         Raises HardwareError after READY_S."""
-        simulation = Simulation(self.settings)
+        simulation = self.simulation(self.settings)
         try:
             ready = simulation.until(lambda row: row[AT["state"]] == arming.READY, READY_S)
             row = simulation.row
@@ -80,13 +97,16 @@ class SimulatedRig:
         model: CompensatorModel | None = None,
         every_s: float = EVERY_S,
         rest: bool = True,
-    ) -> Iterator[np.ndarray]:
+        gains: Gains | None = None,
+    ) -> Generator[np.ndarray, None, None]:
         """Yield the rows of a test, one every `every_s`, compensated by `model` if given.
 
-        `earlier`, `at_s` and `rest` are not used: the rows are reproducible, and the rig starts at rest.
+        `gains` are applied after arming, without a jump. `earlier`, `at_s` and `rest` are not used: the rows are
+        reproducible, and the rig starts at rest.
         Raises Aborted when the law leaves ARMED or the user ends it.
         """
-        simulation = Simulation(with_model(self.settings, model), model)
+        settings = with_model(self.settings, model)
+        simulation = self.simulation(settings, model)
 
         def stop() -> bool:
             """Wait while the user pauses the test; return whether he has ended it."""
@@ -95,6 +115,10 @@ class SimulatedRig:
             return keyboard.ended
 
         try:
+            if gains is not None:
+                simulation.arm()
+                simulation.reload(law_parameters(with_gains(settings, gains)))
+                simulation.tick()
             yield from experiments.run(
                 simulation, schedule, max(1, round(every_s / simulation.period_s)), 0.0, progress, stop
             )

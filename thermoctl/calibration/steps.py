@@ -18,10 +18,12 @@ from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import Recorded, read
 from thermoctl.calibration.schedules import triangles
+from thermoctl.calibration.tune import Disagrees, tune
 from thermoctl.configuration.settings import Settings
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.filter import Kalman
+from thermoctl.identify.measured_loop import NOTHING
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
@@ -68,9 +70,9 @@ class Response:
 
 @dataclass(frozen=True)
 class Pid:
-    """Present and proposed gains with their margins.
+    """Present and proposed gains with their measured margins; the proposed ones are proven, or the present ones.
 
-    Of each: kp, ti_s, td_s, how, and the fields of tuning.Margins."""
+    Of each: kp, ti_s, td_s, how, and the fields of measured_loop.Measured."""
 
     summary: str
     present: dict[str, Any]
@@ -165,24 +167,27 @@ def response(settings: Settings, rig: drive.DrivenRig) -> Response:
     )
 
 
-def pid(settings: Settings, found: Response) -> Pid:
-    """Propose gains for the fitted response, with the margins of these and of the present ones."""
-    c, period_s = settings.control, settings.loop.period_s
-    average = int(c.moving_average)
-    fitted = tuning.SecondOrder(found.gain, complex(*found.t1), complex(*found.t2), found.theta_s)
-    gains = {
-        "present": tuning.Gains(c.kp, c.ti_s, c.td_s, "present"),
-        "proposed": tuning.robust(fitted, period_s, average),
-    }
-    margins = {k: tuning.margins(fitted, g, period_s, average) for k, g in gains.items()}
-    summary = "; ".join(
-        f"{k}: gain margin {m.gain:.2f}, phase margin {m.phase_deg:.0f} deg" for k, m in margins.items()
-    )
-    plain = {
-        k: {"kp": g.kp, "ti_s": g.ti_s, "td_s": g.td_s, "how": g.how, **asdict(margins[k])}
-        for k, g in gains.items()
-    }
-    return Pid(summary, plain["present"], plain["proposed"])
+def pid(rig: drive.DrivenRig) -> Pid:
+    """Propose gains and prove them on the rig; without proven ones the present gains stay, with the reason.
+
+    Raises HardwareError when the rig ends a test, InputError when it is not READY."""
+    c = rig.settings.control
+    present = proposed = tuning.Gains(c.kp, c.ti_s, c.td_s, "present")
+    before = after = NOTHING
+    said: list[str] = []
+    try:
+        found = tune(rig, "imc", True, Keyboard(False), said.append)
+        proposed, before, after = found.proposed, found.before, found.after or NOTHING
+        summary = f"present: {before}; " + (
+            "nothing to change" if proposed == found.present else f"proposed, each step measured: {after}"
+        )
+    except (InputError, Disagrees) as e:
+        summary = f"the present gains stay: {e}"
+    plain = [
+        {"kp": g.kp, "ti_s": g.ti_s, "td_s": g.td_s, "how": g.how, **asdict(m)}
+        for g, m in ((present, before), (proposed, after))
+    ]
+    return Pid(summary, *plain)
 
 
 def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: Path) -> Model:

@@ -156,7 +156,7 @@ class Wizard:
             case "step":
                 return steps.response(self.settings, self.rig)
             case "pid":
-                return steps.pid(self.settings, self.result("step", steps.Response))
+                return steps.pid(self.rig)
             case "model":
                 return steps.model(self.settings, recordings, self.order, self._model_path)
         return steps.proof(self.settings, recordings, self.order, acting=not self.rig.real)

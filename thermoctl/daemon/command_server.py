@@ -15,6 +15,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from thermoctl.daemon.answers.display import fault_lines
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.control_socket import settled
 from thermoctl.daemon.tick import arrival
+from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.daemon.tick.loop import RELOAD
-from thermoctl.daemon.tick.shared import Shared
+from thermoctl.daemon.tick.shared import TRIAL, Shared
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.rig.make import can_drive
 
@@ -37,6 +39,10 @@ ANSWER_S = 1.0  # time within which the loop must take a command
 
 class Commands:
     """Obeys the requests.
+
+    Gains on trial (command `gains`) last as long as the connection that armed the rig, and no longer than the
+    rig is armed. They are given up by disarming, by the connection's end, by a reload and before arming; a
+    command process that replaces one that was killed gives them up, too.
 
     `reload_settings(settings in force, settings at the start)` reads the file again and returns (settings,
     parameters, applied keys, keys that need a restart).
@@ -53,13 +59,22 @@ class Commands:
         self.reload_settings, self.log = reload_settings, log
         self.expected_hz = arrival.expected_hz(settings)
         self.can_drive = can_drive(settings)
+        if shared.counters[
+            TRIAL
+        ]:  # of a command process that was killed; the file still has the gains of before
+            with contextlib.suppress(InputError):
+                self.settings = reload_settings(settings, settings)[0]
+            with contextlib.suppress(InputError):  # the loop is not there: the next arming tries again
+                self.let_go("the command process before this one")
 
-    def answer(self, line: bytes, peer: str) -> dict[str, Any]:
-        """Answer one request line; nothing that a client sends raises an exception."""
-        answer = self._answer(line, peer)
+    def answer(self, line: bytes, peer: str, holds: bool = False) -> dict[str, Any]:
+        """Answer one request line; nothing that a client sends raises an exception.
+
+        holds: whether the client's connection is the one that armed the rig."""
+        answer = self._answer(line, peer, holds)
         return {"axis": self.started.axis, **answer} if self.started.axis else answer
 
-    def _answer(self, line: bytes, peer: str) -> dict[str, Any]:
+    def _answer(self, line: bytes, peer: str, holds: bool) -> dict[str, Any]:
         try:
             request = json.loads(line)
             if not isinstance(request, dict) or not isinstance(request.get("command"), str):
@@ -80,13 +95,14 @@ class Commands:
             "disarm": self._disarm,
             "setpoint": self._setpoint,
             "reload": self._reload,
+            "gains": lambda request: self._gains(request, holds),
         }
         action = actions.get(name)
         if action is None:
             return {
                 "ok": False,
                 "error": f"unknown command '{name[:40]}'; "
-                "expected status, latency, signals, arm, disarm, setpoint or reload",
+                "expected status, latency, signals, arm, disarm, setpoint, reload or gains",
             }
         try:
             answer = action(request)
@@ -155,6 +171,7 @@ class Commands:
                 "ARMED",
                 "not armed, a fault is latched: `thermoctl disarm` acknowledges it once its cause is gone",
             )
+        self._give_up_trial()
         self._send(arming.ARM)
         answer = self._result("ARMED", "not armed")
         return {**answer, "held": held and answer["ok"]}
@@ -164,9 +181,47 @@ class Commands:
         if self._state() == "ARMED":
             self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
             self._send(arming.DISARM)
+        self._give_up_trial()
+
+    def _give_up_trial(self) -> None:
+        """Put the gains of the configuration in force again."""
+        if self.shared.counters[TRIAL]:
+            self._apply(law_parameters(self.settings))
+            self.shared.counters[TRIAL] = 0.0
+
+    def _apply(self, parameters: Parameters) -> None:
+        self.shared.parameters.put(parameters.pack())
+        self._send(RELOAD)
+
+    def _gains(self, request: dict[str, Any], holds: bool) -> dict[str, Any]:
+        """Answer the configuration's gains, or try others in the session of the connection that armed the rig."""
+        control = self.settings.control
+        names = ("kp", "ti_s", "td_s")
+        if not set(names) & set(request):
+            return {"ok": True, **{n: getattr(control, n) for n in names}}
+        if not holds or self._state() != "ARMED":
+            return {
+                "ok": False,
+                "error": "gains not taken: they are tried only over the connection that armed the rig "
+                "(`thermoctl tune --write`); others are written into the file, then `thermoctl reload`",
+            }
+        options = {f.name: f.metadata["option"] for f in fields(control)}
+        tried = []
+        for n in names:
+            value, low, high = request.get(n), options[n].low, options[n].high
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                raise InputError(
+                    f"gains: {n}: a number from {low:g} to {high:g} was expected, found {value!r}"
+                )
+            tried.append(float(value))
+        self.shared.counters[TRIAL] = 1.0
+        control = replace(control, kp=tried[0], ti_s=tried[1], td_s=tried[2])
+        self._apply(law_parameters(replace(self.settings, control=control)))
+        return {"ok": True, "generation": status(self.shared).get("generation")}
 
     def _disarm(self, request: dict[str, Any]) -> dict[str, Any]:
         self._send(arming.DISARM)
+        self._give_up_trial()
         now = self._state()
         if now in ("SAFE", "READY", "OFF"):
             return {"ok": True, "state": now, "held": False}
@@ -189,8 +244,8 @@ class Commands:
 
     def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
-        self.shared.parameters.put(parameters.pack())
-        self._send(RELOAD)
+        self._apply(parameters)
+        self.shared.counters[TRIAL] = 0.0
         self.settings = settings
         return {
             "ok": True,
@@ -274,7 +329,7 @@ def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector
             client.received += data
         if not client.unsent and b"\n" in client.received:
             line, client.received = client.received.split(b"\n", 1)
-            answer = commands.answer(line, client.peer)
+            answer = commands.answer(line, client.peer, client.holds)
             client.holds = answer.pop("held", client.holds)
             client.unsent = json.dumps(answer).encode() + b"\n"
         if not client.unsent and len(client.received) > MAX_LINE:

@@ -16,12 +16,18 @@ Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags tha
     series form     Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2
     parallel form   Kp = Kc (1 + tD/tI), Ti = tI + tD, Td = tI tD/(tI + tD)
 
+A loop without derivative stays without: PI by the half rule, t1 + t2/2 and theta + t2/2.
+
 Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
-moving average.
+moving average. A recording cannot tell a short lag from dead time, and a loop that is faster than the one of
+the recording depends on which it is. So a proposal has its margins on two models: the fitted one, and
+`pessimist`, where the short lag is dead time, and where half a command period, the ticks' jitter and the
+phase's uncertainty are more dead time.
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -33,20 +39,33 @@ from scipy import optimize, signal
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
-UNCERTAIN_DEG = 5.0  # no gains are proposed when the phase near the crossover has a larger standard error
+UNCERTAIN_DEG = 40.0  # no gains are proposed when the phase near the crossover has a larger standard error; a smaller one is dead time
+ANSWERS = 10.0  # least gain of the response in its standard errors: a fit of noise reaches 5
+WANTED_DEG, WANTED_GAIN = 45.0, 2.0  # least phase margin and gain margin of a proposal
+# Largest change of a gain in one proposal. The recording was made with the present loop, whose motion hardly
+# reaches the frequencies at which a loop several times faster has its margins.
+FACTOR = 3.0
+# Largest change of a gain in one step on the rig: less than WANTED_GAIN, so that a loop that has just shown
+# its margins does not become unstable by one step.
+STEP = 1.5
+TURNS = 3.0  # a loop's phase passes 180 deg at about this multiple of its crossover
+SHORTEST_S = 1e-6  # lag in the place of none
+BLOCK_S = 1.0  # the residuals of such blocks count as independent
 
 
 @dataclass(frozen=True)
 class SecondOrder:
     """K0 e^(-s theta) / ((t1 s + 1)(t2 s + 1)), or oscillating: `t1`, `t2` are then complex conjugate.
 
-    Gain in um per unit of drive."""
+    Gain in um per unit of drive. Of a fit: residual um, and uncertain_s, the standard error of the phase near
+    the crossover, as a dead time."""
 
     gain: float
     t1: complex
     t2: complex
     theta_s: float
     residual: float = 0.0
+    uncertain_s: float = 0.0
 
     def step(self, t: np.ndarray) -> np.ndarray:
         """Return the response to a unit step at t = 0."""
@@ -79,11 +98,19 @@ class Gains:
     figures: dict[str, float] = field(default_factory=dict)
 
 
-def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s: float) -> SecondOrder:
+def fit_response(
+    t_s: np.ndarray,
+    drive: np.ndarray,
+    y_um: np.ndarray,
+    period_s: float,
+    least_s: float = 0.0,
+    present: Gains | None = None,
+) -> SecondOrder:
     """Fit the second order with dead time that gives positions y_um (N,) from drives (N,) at times t_s (N,).
 
     Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept
-    the drive before it. Raises InputError when the recording does not determine the response."""
+    the drive before it. least_s: the dead time is at least this. present: gains whose FACTOR is the fastest
+    loop that matters; None: any. Raises InputError when the recording does not determine the response."""
     at = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
     n = int(at[-1]) + 1
     if len(at) < 20:
@@ -108,31 +135,74 @@ def fit_response(t_s: np.ndarray, drive: np.ndarray, y_um: np.ndarray, period_s:
         return (x @ y) / max(x @ x, 1e-300) * x - y
 
     starts = ((300.0, 0.3), (300.0, 1.5), (100.0, 3.0))  # (1/s, damping)
-    bounds = ([0.0, -4.0, np.log(0.02 * period_s)], [12.0, 4.0, np.log(200 * period_s)])
+    least = np.log(max(0.02 * period_s, least_s))
+    bounds = ([0.0, -4.0, least], [12.0, 4.0, np.log(200 * period_s + least_s)])
     tries = [
-        optimize.least_squares(residual, np.log([wn, zeta, period_s]), bounds=bounds, max_nfev=60)
+        optimize.least_squares(
+            residual,
+            [np.log(wn), np.log(zeta), max(np.log(period_s), least + 0.1)],
+            bounds=bounds,
+            max_nfev=60,
+        )
         for wn, zeta in starts
     ]
     best = min(tries, key=lambda r: r.cost)
     x = unit_response(best.x)
     rms = float(np.sqrt(2 * best.cost / len(y)))
-    normal = best.jac.T @ best.jac
-    covariance = rms**2 * np.linalg.inv(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(3))
+    covariance = _covariance(best.jac, best.fun, round(BLOCK_S / period_s))
     w = np.geomspace(0.1, 1 / period_s, 400)
     phases = np.unwrap(np.angle(model(best.x).frequency(w)))
     k = min(int(np.searchsorted(-phases, np.pi * 2 / 3)), len(w) - 1)
     w = w[k : k + 1]  # the crossover with 60 degrees left
+    if present is not None:
+        fitted = model(best.x, float(x @ y / max(x @ x, 1e-300)))
+        w = np.minimum(w, TURNS * _crossover(fitted, replace(present, kp=FACTOR * present.kp)))
     slope = [
         np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
         for d in 1e-3 * np.eye(3)
     ]
-    uncertain_deg = float(np.degrees(np.sqrt(slope @ covariance @ slope)))
-    if not np.any(x) or uncertain_deg > UNCERTAIN_DEG:
+    uncertain = float(np.sqrt(slope @ covariance @ slope))
+    uncertain_deg = np.degrees(uncertain)
+    size = float(np.sqrt(x @ x))
+    if not size or abs(x @ y) / size < ANSWERS * rms or uncertain_deg > UNCERTAIN_DEG:
         raise InputError(
             f"the position moved by {np.ptp(y):.3g} um with {rms:.2g} um of noise: its phase at {w[0] / (2 * np.pi):.3g} Hz is "
             f"known to {uncertain_deg:.2g} deg only, {UNCERTAIN_DEG:g} were expected; raise control.setpoint_rate_um_s"
         )
-    return replace(model(best.x, float(x @ y / (x @ x))), residual=rms)
+    gain = float(x @ y / (x @ x))
+    return replace(model(best.x, gain), residual=rms, uncertain_s=uncertain / float(w[0]))
+
+
+def _crossover(model: SecondOrder, gains: Gains) -> float:
+    """Return the largest frequency, 1/s, at which the loop's gain is 1, in continuous time."""
+    w = np.geomspace(1e-2, 1e5, 2000)
+    d = gains.kp * (1 + 1 / (1j * w * gains.ti_s) + 1j * w * gains.td_s)
+    over = np.flatnonzero(np.abs(d * model.frequency(w)) >= 1)
+    return float(w[over[-1]]) if len(over) else float(w[0])
+
+
+def _covariance(slopes: np.ndarray, residuals: np.ndarray, block: int) -> np.ndarray:
+    """Return the covariance (p, p) of fitted parameters from slopes (N, p) and residuals (N,).
+
+    Residuals of one block may depend on each other, those of two do not: the sandwich of clustered data."""
+    p = slopes.shape[1]
+    normal = slopes.T @ slopes
+    bread = np.linalg.inv(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(p))
+    starts = np.arange(0, len(residuals), max(1, min(block, len(residuals) // 8)))
+    scores = np.add.reduceat(slopes * residuals[:, None], starts)
+    few = len(starts) / max(len(starts) - p, 1)
+    return bread @ (scores.T @ scores) @ bread * few
+
+
+def pessimist(model: SecondOrder, delay_s: float) -> SecondOrder:
+    """Return the slowest answer that the recording allows, for loops faster than the recorded one.
+
+    A short lag becomes dead time; twice the standard error and delay_s are added."""
+    more = delay_s + 2.0 * model.uncertain_s
+    if abs(complex(model.t1).imag) > 1e-12:
+        return replace(model, theta_s=model.theta_s + more)
+    t2, t1 = sorted((float(np.real(model.t1)), float(np.real(model.t2))))
+    return replace(model, t1=t1, t2=min(SHORTEST_S, t2), theta_s=model.theta_s + t2 + more)
 
 
 def tangent(model: SecondOrder) -> tuple[float, float, float]:
@@ -147,9 +217,11 @@ def tangent(model: SecondOrder) -> tuple[float, float, float]:
     return model.gain, float(t[k] - y[k] / slope[k]), float(1 / slope[k])
 
 
-def ziegler_nichols(model: SecondOrder) -> Gains:
-    """Table I from the fitted step response."""
+def ziegler_nichols(model: SecondOrder, derivative: bool = True) -> Gains:
+    """Table I from the fitted step response; without derivative Ziegler and Nichols' PI controller."""
     k0, tau_d, tau_c = tangent(model)
+    if not derivative:
+        return Gains(0.9 * tau_c / (k0 * tau_d), 3.33 * tau_d, 0.0, "Ziegler-Nichols, step, PI")
     return Gains(
         1.2 * tau_c / (k0 * tau_d),
         2 * tau_d,
@@ -159,20 +231,22 @@ def ziegler_nichols(model: SecondOrder) -> Gains:
     )
 
 
-def imc(model: SecondOrder, lambda_s: float | None = None) -> Gains:
+def imc(model: SecondOrder, lambda_s: float | None = None, derivative: bool = True) -> Gains:
     """Lambda tuning; `lambda_s` (closed-loop time constant) defaults to the dead time, Skogestad's choice."""
     theta = model.theta_s
-    if abs(complex(model.t1).imag) > 1e-12:
+    oscillates = abs(complex(model.t1).imag) > 1e-12
+    t1, t2 = sorted((float(np.real(model.t1)), float(np.real(model.t2))), reverse=True)
+    if not derivative:
+        t1, t2, theta = t1 + t2 / 2, 0.0, theta + t2 / 2
+    lam = theta if lambda_s is None else lambda_s
+    if oscillates and derivative:
         wn2 = 1 / np.real(model.t1 * model.t2)
         two_zeta_wn = np.real(model.t1 + model.t2) * wn2
         ti, td = two_zeta_wn / wn2, 1 / two_zeta_wn
-        lam = theta if lambda_s is None else lambda_s
         return Gains(ti / (model.gain * (lam + theta)), ti, td, "IMC, oscillating plant", {"lambda_s": lam})
-    t1, t2 = sorted((float(np.real(model.t1)), float(np.real(model.t2))), reverse=True)
-    lam = theta if lambda_s is None else lambda_s
     ti = min(t1, 4 * (lam + theta))
     kc, td = t1 / (model.gain * (lam + theta)), t2
-    return Gains(kc * (1 + td / ti), ti + td, ti * td / (ti + td), "lambda / IMC", {"lambda_s": lam})
+    return Gains(kc * (1 + td / ti), ti + td, ti * td / (ti + td), "IMC", {"lambda_s": lam})
 
 
 @dataclass(frozen=True)
@@ -186,19 +260,36 @@ class Margins:
     peak_sensitivity: float
 
 
+@functools.lru_cache(maxsize=16)
+def _plant(model: SecondOrder, period_s: float, moving_average: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies w (K,), 1/s, up to half the sampling rate, and G(z) with the moving average (K,)."""
+    w = np.geomspace(1e-2, np.pi / period_s, 8000)
+    return w, plant_at(w, model, period_s, moving_average)
+
+
+def plant_at(w: np.ndarray, model: SecondOrder, period_s: float, moving_average: int) -> np.ndarray:
+    """Return G(z) with a zero-order hold and the moving average at frequencies w (K,), 1/s."""
+    z = np.exp(1j * w * period_s)
+    average = (
+        np.ones_like(z) if moving_average == 1 else (1 - z**-moving_average) / (1 - 1 / z) / moving_average
+    )
+    return average * _held(model, w, period_s)
+
+
+def controller_at(w: np.ndarray, gains: Gains, period_s: float) -> np.ndarray:
+    """Return D(z) of PID (41) at frequencies w (K,), 1/s."""
+    z = np.exp(1j * w * period_s)
+    k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
+    return k * ((1 + ts / ti + td / ts) - (1 + 2 * td / ts) / z + td / ts / z**2) / (1 - 1 / z)
+
+
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
     """Return the margins of PID (41) at `period_s` on the model with a zero-order hold.
 
     The moving average of `moving_average` samples is included.
     """
-    w = np.geomspace(1e-2, np.pi / period_s, 40_000)
-    z = np.exp(1j * w * period_s)
-    k, ti, td, ts = gains.kp, gains.ti_s, gains.td_s, period_s
-    d = k * ((1 + ts / ti + td / ts) - (1 + 2 * td / ts) / z + td / ts / z**2) / (1 - 1 / z)
-    average = (
-        np.ones_like(z) if moving_average == 1 else (1 - z**-moving_average) / (1 - 1 / z) / moving_average
-    )
-    loop = d * average * np.array(_held(model, w, ts))
+    w, plant = _plant(model, period_s, moving_average)
+    loop = controller_at(w, gains, period_s) * plant
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))
     cross = np.flatnonzero((size[:-1] >= 1) & (size[1:] < 1))
@@ -225,35 +316,94 @@ def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
     return out
 
 
+def share_of_margins(
+    models: Sequence[SecondOrder], gains: Gains, period_s: float, moving_average: int = 1
+) -> float:
+    """Return the smallest margin on any model as a share of the wanted one: 1 or more is good, 0 unstable."""
+    found = [margins(m, gains, period_s, moving_average) for m in models]
+    return min(min(m.phase_deg / WANTED_DEG, m.gain / WANTED_GAIN) if m.stable else 0.0 for m in found)
+
+
 def robust(
-    model: SecondOrder, period_s: float, moving_average: int = 1, phase_deg: float = 45.0, gain: float = 2.0
+    models: Sequence[SecondOrder], period_s: float, moving_average: int = 1, derivative: bool = True
 ) -> Gains:
-    """Return the fastest lambda tuning with at least these margins.
+    """Return the fastest lambda tuning of the first model with the wanted margins on all of them.
 
     Raises InputError when none up to 1000 dead times has them."""
     for factor in np.geomspace(0.3, 1000, 60):
-        g = imc(model, factor * max(model.theta_s, period_s))
-        m = margins(model, g, period_s, moving_average)
-        if m.stable and m.phase_deg >= phase_deg and m.gain >= gain:
-            return Gains(
-                g.kp,
-                g.ti_s,
-                g.td_s,
-                f"lambda / IMC with at least {phase_deg:g} deg and factor {gain:g}",
-                {**g.figures, "gain_margin": m.gain, "phase_margin_deg": m.phase_deg},
+        g = imc(models[0], factor * max(models[-1].theta_s, period_s), derivative)
+        if share_of_margins(models, g, period_s, moving_average) >= 1.0:
+            return replace(
+                g, how=f"IMC; at least {WANTED_DEG:g} deg phase and factor {WANTED_GAIN:g} gain margin"
             )
     raise InputError("no lambda tuning reaches the wanted margins on this model")
 
 
+def within_factor(present: Gains, wanted: Gains, factor: float = FACTOR) -> Gains:
+    """Return the wanted gains, each at most `factor` times, and at least a `factor`-th, of the present one."""
+    kp, ti, td = (
+        min(max(b, a / factor), a * factor) if a > 0.0 else b
+        for a, b in zip(_three(present), _three(wanted), strict=True)
+    )
+    return replace(wanted, kp=kp, ti_s=ti, td_s=td)
+
+
+def way(present: Gains, proposed: Gains) -> list[Gains]:
+    """Return the gains of each step from the present to the proposed ones, the last included.
+
+    No gain changes by more than STEP in one step; a gain that is 0 stays 0."""
+    a, b = np.array(_three(present)), np.array(_three(proposed))
+    ratio = np.where((a > 0.0) & (b > 0.0), b / np.where(a > 0.0, a, 1.0), 1.0)
+    n = max(1, int(np.ceil(np.abs(np.log(ratio)).max() / np.log(STEP) - 1e-9)))
+    steps = [a * ratio ** (k / n) for k in range(1, n)]
+    return [
+        *(replace(proposed, kp=kp, ti_s=ti, td_s=td) for kp, ti, td in map(np.ndarray.tolist, steps)),
+        proposed,
+    ]
+
+
+def propose(
+    models: Sequence[SecondOrder], present: Gains, wanted: Gains, period_s: float, moving_average: int = 1
+) -> list[Gains]:
+    """Return the steps from the present gains towards the wanted ones, at most FACTOR away; the last is the proposal.
+
+    Each step has the wanted margins on all models, or no smaller ones than the present gains; its kp is
+    lowered where it must be. Raises InputError where that does not help."""
+    least = min(1.0, share_of_margins(models, present, period_s, moving_average))
+    target = _slower(models, present, within_factor(present, wanted), 1.0, period_s, moving_average)
+    return [
+        *(
+            _slower(models, present, g, 0.99 * least, period_s, moving_average)
+            for g in way(present, target)[:-1]
+        ),
+        target,
+    ]
+
+
+def _slower(
+    models: Sequence[SecondOrder], present: Gains, gains: Gains, least: float, period_s: float, average: int
+) -> Gains:
+    """Lower kp, to a FACTOR-th of the present one at most, until the share of the margins is `least`."""
+    while share_of_margins(models, gains, period_s, average) < least:
+        gains = replace(gains, kp=0.95 * gains.kp)
+        if gains.kp < present.kp / FACTOR:
+            raise InputError(
+                f"no gains within a factor of {FACTOR:g} of the present ones have {WANTED_DEG:g} deg and a factor of "
+                f"{WANTED_GAIN:g} of margin on this response: lower kp by hand, `thermoctl reload`, and run it again"
+            )
+    return gains
+
+
+def _three(g: Gains) -> tuple[float, float, float]:
+    return g.kp, g.ti_s, g.td_s
+
+
 def difference(present: Gains, proposed: Gains) -> str:
     """Return the change as lines of text; nothing is written."""
-    rows = [
-        ("kp", present.kp, proposed.kp),
-        ("ti_s", present.ti_s, proposed.ti_s),
-        ("td_s", present.td_s, proposed.td_s),
-    ]
+    names = ("kp", "ti_s", "td_s")
+    rows = zip(names, _three(present), _three(proposed), strict=True)
     return "\n".join(
-        f"  {n:5s} {a:10.4g} -> {b:10.4g}   ({100 * (b / a - 1) if a else float('inf'):+.0f} %)"
+        f"  {n:5s} {a:10.4g} -> {b:10.4g}   ({f'{100 * (b / a - 1):+.0f} %' if a else 'new' if b else 'stays'})"
         for n, a, b in rows
     )
 
