@@ -295,3 +295,8 @@ rigs: develop                      # rigs of 2, 4 and 8 points: calibrated from 
 
 wire-rigs: develop                 # four shipped rigs at the wire: calibrated, compensated, a hidden effect diagnosed; an hour and a half
 	$(BIN)/python -m tests.rigs.wire_rigs
+
+.PHONY: prove-tune
+TUNES ?= 200
+prove-tune: develop                # tunes on loops of known truth, with skipped ticks and slow commands: docs/proof/tuning.md; minutes
+	$(BIN)/python -m tests.tune.prove --number $(TUNES) --page docs/proof/tuning.md

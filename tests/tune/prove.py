@@ -233,8 +233,8 @@ def main():
                 t = case.truth
                 print(
                     f"{k:3d} {r.outcome:8s}{'UNSTABLE ' if r.unstable else 'WORSE ' if r.worse else ''}skips {100 * t.skips:.2g} % jitter "
-                    f"{t.jitter_s / t.period_s:.2g} command {t.command_hz:g} Hz dead {1e3 * t.dead_s:.2g} t1 {1e3 * t.t1_s:.2g} t2 {1e3 * t.t2_s:.2g} "
-                    f"period {1e3 * t.period_s:g} ms noise {t.noise_um:.2g} rate {case.rate_um_s:g}: "
+                    f"{t.jitter_s / t.period_s:.2g} command {t.command_hz:g} Hz dead {1e3 * t.dead_s:.2g} t1 {1e3 * t.t1_s:.2g}, {1e3 * t.t2_s:.2g} "
+                    f"period {1e3 * t.period_s:g} ms noise {t.noise_um:.2g} at {case.rate_um_s:g}: "
                     f"gain margin {r.before[0]:.2f} -> {r.after[0]:.2f}, phase {r.before[1]:.0f} -> {r.after[1]:.0f}, load {r.before[2]:.3g} -> "
                     f"{r.after[2]:.3g} kp x{r.gains[0] / case.kp:.2g} {r.why}",
                     flush=True,
@@ -252,7 +252,7 @@ def main():
         command = f"python -m tests.tune.prove --number {a.number} --seed {a.seed}"
         head = Path(a.page).read_text().split("<!-- result -->")[0]
         Path(a.page).write_text(
-            f"{head}<!-- result -->\n{datetime.now(UTC):%Y-%m-%d}, commit {commit}, `{command}`, {time.process_time() - begin:.0f} s of processor.\n\n"
+            f"{head}<!-- result -->\n{datetime.now(UTC):%Y-%m-%d}, commit {commit}, `{command}`, {time.process_time() - begin:.0f} s of CPU.\n\n"
             + "\n".join(lines)
             + "\n"
         )

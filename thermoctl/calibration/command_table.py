@@ -16,7 +16,7 @@ TABLE: Table = {
             argument("--out", metavar="DIR", help="the calibration's folder (default calibration/RIG)"),
             MODELS,
             ORDER,
-            argument("--gains", action="store_true", help="on acceptance also write the proposed PID gains"),
+            argument("--gains", action="store_true", help="on acceptance also write the proven PID gains"),
             argument("--accept", action="store_true", help="install the model when the proof is done"),
             argument("--again", action="store_true", help="discard an earlier run in the folder"),
             YES,
@@ -35,7 +35,11 @@ TABLE: Table = {
                 help="imc: lambda tuning with a phase margin of 45 deg and a gain margin of 2 (default); "
                 "zn: Ziegler-Nichols, Table I of the paper",
             ),
-            argument("--write", action="store_true", help="write the proposal into the configuration"),
+            argument(
+                "--write",
+                action="store_true",
+                help="prove each step towards the proposal on the rig, then write it into the configuration",
+            ),
             YES,
         ),
         command(

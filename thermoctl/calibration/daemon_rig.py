@@ -32,7 +32,7 @@ from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.rig.signals import AT
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.make import driving_devices
+from thermoctl_hal.rig.make import driving_devices
 
 POLL_S = 0.01  # between two polls of the rig and of the keyboard
 # after this time without a tick the loop has ended (the supervisor's STALL_S; at least protection.late_s)

@@ -50,10 +50,7 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Response:
-    """The position's response to short ramps: a fitted second-order system with dead time.
-
-    `t1`, `t2`: real and imaginary part of the time constants, s.
-    """
+    """The position's response to short ramps: a fitted second-order system with dead time."""
 
     summary: str
     t: list[float]
@@ -62,10 +59,6 @@ class Response:
     k0: float
     tau_d_s: float
     tau_c_s: float
-    gain: float
-    t1: tuple[float, float]
-    t2: tuple[float, float]
-    theta_s: float
 
 
 @dataclass(frozen=True)
@@ -160,10 +153,6 @@ def response(settings: Settings, rig: drive.DrivenRig) -> Response:
         k0,
         tau_d,
         tau_c,
-        fitted.gain,
-        (fitted.t1.real, fitted.t1.imag),
-        (fitted.t2.real, fitted.t2.imag),
-        fitted.theta_s,
     )
 
 

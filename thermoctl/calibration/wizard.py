@@ -245,8 +245,9 @@ class Wizard:
         """List the changes of an acceptance, as lines."""
         lines = [f"install {self._model_path} as the current calibration of {models}/"]
         if gains:
-            difference = tuning.difference(*self.result("pid", steps.Pid).gains())
-            lines.append(f"write into {self.settings.path}:\n{difference}")
+            present, proven = self.result("pid", steps.Pid).gains()
+            difference = f"write into {self.settings.path}:\n{tuning.difference(present, proven)}"
+            lines.append(difference if proven != present else f"keep the gains ({self.done['pid'].summary})")
         if not self._in_use(models):
             now = self.settings.compensation.model or "not set"
             lines.append(
@@ -278,9 +279,9 @@ class Wizard:
         }
         recordings = [self._recording(n) for n in steps.FITTED]
         path = modelfile.install(models, c.model, c.rig, recordings, figures)
-        if gains:
-            gains_found = self.result("pid", steps.Pid).gains()[1]
-            tuning.write(Path(self.settings.path), gains_found, self.settings.axis)
+        present, proven = self.result("pid", steps.Pid).gains()
+        if gains and proven != present:
+            tuning.write(Path(self.settings.path), proven, self.settings.axis)
         if not self._in_use(models):
             try:
                 values = {"model": f"{self._model_option(models)}  # written by `thermoctl calibrate`"}

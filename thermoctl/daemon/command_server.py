@@ -16,6 +16,7 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class Commands:
             "disarm": self._disarm,
             "setpoint": self._setpoint,
             "reload": self._reload,
-            "gains": lambda request: self._gains(request, holds),
+            "gains": partial(self._gains, holds),
         }
         action = actions.get(name)
         if action is None:
@@ -193,7 +194,7 @@ class Commands:
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)
 
-    def _gains(self, request: dict[str, Any], holds: bool) -> dict[str, Any]:
+    def _gains(self, holds: bool, request: dict[str, Any]) -> dict[str, Any]:
         """Answer the configuration's gains, or try others in the session of the connection that armed the rig."""
         control = self.settings.control
         names = ("kp", "ti_s", "td_s")

@@ -1,8 +1,9 @@
 """The tuner process: learns the expansion model from the ring while the reference encoder is connected.
 
 compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
-of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. `status`
-shows the progress in percent.
+of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. It is
+proven by samples that came after it: where it predicts those worse than the model before, that one is current
+again, and no further one is proposed before. `status` shows the progress in percent.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.tick.shared import TUNING, Shared
 from thermoctl.identify import modelfile
+from thermoctl.identify.measured_loop import SLIPS
 from thermoctl.identify.online import Tuner
 from thermoctl.rig.channels import AT as CHANNEL_AT
 from thermoctl.rig.channels import DEFAULT, Channels
@@ -25,6 +27,7 @@ from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
 PROPOSE_S = 600.0  # rig time between two checks of the proposal
+_TICK, _SLIPS = AT["tick"], AT["slips"]
 _T, _AIR = AT["t_s"], AT["air_c"]
 _POSITION, _REFERENCE = AT["position_raw_um"], AT["output_reference_um"]
 _BOTH = [CHANNEL_AT["position_um"], CHANNEL_AT["output_reference_um"]]
@@ -50,6 +53,9 @@ class Tuning:
         self.row = of_channels(channels)
         self.tuner = tuner or Tuner(model)
         self.period_s = model.expansion_period_s
+        self.unproven: tuple[CompensatorModel, Path] | None = (
+            None  # the model before, the file of the new one
+        )
         self.zero_um = self.air_c = float("nan")
         self.proposed_s = 0.0
         self._rows: list[np.ndarray] = []
@@ -66,7 +72,9 @@ class Tuning:
         self._rows = [rows[ends[-1] if len(ends) else 0 :]]
 
     def _sample(self, rows: np.ndarray) -> None:
-        good = ~self.row.states(rows)[:, _BOTH].any(axis=1)
+        skipped, made = (float(rows[-1, k] - rows[0, k]) for k in (_SLIPS, _TICK))
+        is_test = skipped <= SLIPS * (made + skipped)  # one whose ticks were skipped is none
+        good = is_test & ~self.row.states(rows)[:, _BOTH].any(axis=1)
         error = (
             float(np.mean((rows[:, _REFERENCE] - rows[:, _POSITION])[good])) if good.any() else float("nan")
         )
@@ -85,7 +93,27 @@ class Tuning:
             self.proposed_s = float(rows[-1, _T])
             self._propose()
 
+    def _prove(self, before: CompensatorModel, path: Path) -> None:
+        """Judge the newest calibration by the samples since; put the one before back where that is better."""
+        if len(self.tuner.recent) < self.tuner.hold:
+            return
+        self.unproven = None
+        was, is_now = self.tuner.error_um(before), self.tuner.error_um(self.tuner.model)
+        if is_now > was and self.folder is not None and modelfile.current(self.folder) == path:
+            back = modelfile.roll_back(self.folder)
+            self.say(
+                f"{path}: {is_now:.3g} um since then against {was:.3g} um with the one before; {back} is current again"
+            )
+            self._restart(before)
+
+    def _restart(self, model: CompensatorModel) -> None:
+        t = self.tuner
+        self.tuner = Tuner(model, tuple(t.edges), t.full, t.clip, t.hold * self.period_s)
+
     def _propose(self) -> None:
+        if self.unproven is not None:
+            self._prove(*self.unproven)
+            return
         new, why = self.tuner.proposal()
         if new is None:
             return
@@ -93,12 +121,11 @@ class Tuning:
             path = modelfile.install(
                 self.folder, new, self.rig, figures={"tuned_online": why, "samples": self.tuner.bank.samples}
             )
+            self.unproven = self.tuner.model, path
             self.say(
                 f"{path}: {why}; in use from the next start on, `thermoctl model rollback` takes it back"
             )
-        self.tuner = Tuner(
-            new, tuple(self.tuner.edges), self.tuner.full, self.tuner.clip, self.tuner.hold * self.period_s
-        )
+        self._restart(new)
 
 
 def check(settings: Settings) -> None:

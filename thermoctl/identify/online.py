@@ -82,8 +82,7 @@ class Tuner:
         gains = calibrated_gains(self.model)
         width = self.clip * max(np.abs(gains).max(), 1e-12)
         new = self.bank.bounded(gains - width, gains + width)
-        now = Expansion(self.model.f1, self.model.b1, self.model.b2, self.model.expansion_period_s)
-        before, after = self._error(now), self._error(new)
+        before, after = self.error_um(self.model), self._error(new)
         if not after <= 0.95 * before:
             return None, f"no better: {after:.3g} um against {before:.3g} um with the calibrated model"
         return replace(
@@ -98,6 +97,10 @@ class Tuner:
                 "calibrated_gains_um_k": calibrated_gains(self.model).tolist(),
             },
         ), f"{after:.3g} um against {before:.3g} um"
+
+    def error_um(self, model: CompensatorModel) -> float:
+        """Return the standard error of a model over the newest samples, um."""
+        return self._error(Expansion(model.f1, model.b1, model.b2, model.expansion_period_s))
 
     def _error(self, e: Expansion) -> float:
         """Return the standard error over the held-out samples, um; initial state and offset are fitted."""
