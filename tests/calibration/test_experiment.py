@@ -148,7 +148,9 @@ def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out
     settings = load_settings("rig.yaml")
     assert f"kp: {settings.control.kp:g}" in (quick / "rig.yaml").read_text() and settings.control.kp != 0.01
     proven = re.findall(r"step (\d) of (\d) .*phase margin (\d+) \+- \d deg measured", said)
-    assert [int(k) for k, _, _ in proven] == list(range(1, int(proven[0][1]) + 1)) and int(proven[-1][2]) >= 45
+    assert [int(k) for k, _, _ in proven] == list(range(1, int(proven[0][1]) + 1)) and int(
+        proven[-1][2]
+    ) >= 45
 
     def trips(kp):
         c = dataclasses.replace(settings.control, kp=kp, ti_s=0.004, td_s=0.001)

@@ -58,6 +58,7 @@ def _moved(truth, x1, x2, u, dt):
     return u + d1 * a, u + (x2 - u) * b + d1 * t1 / (t1 - t2) * (a - b)
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def stable(truth, kp, ti_s, td_s, delay_s=0.0):
     """Of each loop (V,), whether its trace dies away: the last third has less energy than the second."""
     t, y = trace(truth, kp, ti_s, td_s, delay_s)
@@ -67,8 +68,7 @@ def stable(truth, kp, ti_s, td_s, delay_s=0.0):
         np.sqrt((y[(t > a * LONGEST_S) & (t <= b * LONGEST_S)] ** 2).mean(0))
         for a, b in ((0, 0.05), (1 / 3, 2 / 3), (2 / 3, 1))
     ]
-    with np.errstate(invalid="ignore"):
-        return np.isfinite(part[2]) & ((part[2] < part[1]) | (part[2] < 1e-6 * part[0]))
+    return np.isfinite(part[2]) & ((part[2] < part[1]) | (part[2] < 1e-6 * part[0]))
 
 
 def margins(truth, kp, ti_s, td_s):
