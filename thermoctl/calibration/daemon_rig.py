@@ -96,8 +96,9 @@ class DaemonRig:
 
         It arms first, and disarms on every way out. While paused, the setpoint is held and rows continue,
         because the rig cools meanwhile. The model is fitted to the measured rows, not to the schedule.
-        `rest`: wait first until the rig is at rest. `gains`: tried until it disarms. Raises Aborted when the law leaves ARMED, the daemon
-        ends, or the user ends the test. Raises HardwareError when the rig does not arm.
+        `rest`: wait first until the rig is at rest. `gains`: tried until it disarms. Raises Aborted when
+        the law leaves ARMED, the daemon ends, or the user ends the test. Raises HardwareError when the rig
+        does not arm.
         """
         if earlier is not None:
             yield rows_of(earlier, self.settings.row)

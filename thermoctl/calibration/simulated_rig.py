@@ -101,8 +101,8 @@ class SimulatedRig:
     ) -> Generator[np.ndarray, None, None]:
         """Yield the rows of a test, one every `every_s`, compensated by `model` if given.
 
-        `gains` are applied after arming, without a jump. `earlier`, `at_s` and `rest` are not used: the rows are
-        reproducible, and the rig starts at rest.
+        `gains` are applied after arming, without a jump. `earlier`, `at_s` and `rest` are not used: the rows
+        are reproducible, and the rig starts at rest.
         Raises Aborted when the law leaves ARMED or the user ends it.
         """
         settings = with_model(self.settings, model)

@@ -63,7 +63,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Pid:
-    """Present and proposed gains with their measured margins; the proposed ones are proven, or the present ones.
+    """Present and proposed gains with their measured margins; without proven gains both are the present ones.
 
     Of each: kp, ti_s, td_s, how, and the fields of measured_loop.Measured."""
 

@@ -49,8 +49,8 @@ def tune(
     """Propose gains from a test of the rig's loop; `verify`: prove each step towards them on the rig.
 
     method: 'imc' or 'zn'. With `verify` the result's gains are proven, or the present ones. Raises InputError
-    where the test gives no gains, Disagrees where a step's loop is not as predicted, HardwareError where the
-    rig ended a test; then the present gains are in force.
+    where the test gives no gains. Raises Disagrees where a step's loop is not as predicted, and HardwareError
+    where the rig ended a test. Then the present gains are in force.
     """
     settings = rig.settings
     period_s, average = settings.loop.period_s, int(settings.control.moving_average)

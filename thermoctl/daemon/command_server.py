@@ -42,8 +42,8 @@ class Commands:
     """Obeys the requests.
 
     Gains on trial (command `gains`) last as long as the connection that armed the rig, and no longer than the
-    rig is armed. They are given up by disarming, by the connection's end, by a reload and before arming; a
-    command process that replaces one that was killed gives them up, too.
+    rig is armed. They are given up by disarming, by the connection's end, by a reload and before arming.
+    A command process that replaces one that was killed gives them up, too.
 
     `reload_settings(settings in force, settings at the start)` reads the file again and returns (settings,
     parameters, applied keys, keys that need a restart).
@@ -195,7 +195,7 @@ class Commands:
         self._send(RELOAD)
 
     def _gains(self, holds: bool, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer the configuration's gains, or try others in the session of the connection that armed the rig."""
+        """Answer the configuration's gains, or try others over the connection that armed the rig."""
         control = self.settings.control
         names = ("kp", "ti_s", "td_s")
         if not set(names) & set(request):

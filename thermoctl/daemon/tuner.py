@@ -2,8 +2,8 @@
 
 compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
 of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. It is
-proven by samples that came after it: where it predicts those worse than the model before, that one is current
-again, and no further one is proposed before. `status` shows the progress in percent.
+proven by samples that came after it. Where it predicts those worse than the model before, that one is current
+again. No further one is proposed until then. `status` shows the progress in percent.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Tuning:
             self._propose()
 
     def _prove(self, before: CompensatorModel, path: Path) -> None:
-        """Judge the newest calibration by the samples since; put the one before back where that is better."""
+        """Compare the newest calibration with the one before, by the samples since; keep the better one."""
         if len(self.tuner.recent) < self.tuner.hold:
             return
         self.unproven = None

@@ -1,13 +1,13 @@
-"""What a test of the position loop shows by itself: whether its ticks came in time, and the loop's own margins.
+"""Results of a test of the position loop: whether its ticks came in time, and the margins of the loop.
 
-The loop is measured, not fitted (Ljung, System Identification, 2nd ed., chapter 6): T = Phi_yr / Phi_rr from
-the recorded reference r, an input that noise does not reach, and the averaged position y that the law used;
-S = 1 - T is its error. L = T/S, with all that acts in it: command periods, dead times, late ticks. Bands of
-frequencies are averaged with the weight of what a prediction expects of them,
+The loop is measured, not fitted (Ljung, System Identification, 2nd ed., chapter 6). T = Phi_yr / Phi_rr, with
+the recorded reference r and the averaged position y that the law used. Noise does not reach r. S = 1 - T,
+L = T/S, with all that acts in the loop: command periods, dead times, late ticks. Bands of frequencies are
+averaged with the weight of a prediction T0:
 
-    T(f) = T0(f) sum Y (T0 R)* / sum |T0 R|^2,
+    T(f) = T0(f) sum Y (T0 R)* / sum |T0 R|^2
 
-so that a right prediction is confirmed without bias, however fast the phase turns within a band.
+So a right prediction is confirmed without bias, however fast the phase turns within a band.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Measured:
 
     @property
     def is_sure(self) -> bool:
-        """Whether both margins are known well enough to judge the loop by, or surely above the wanted ones."""
+        """Whether both margins are known well enough, or surely above the wanted ones."""
         phase = self.phase_deg - 2.0 * self.phase_error_deg >= WANTED_DEG or self.phase_error_deg <= SURE_DEG
         error = 0.0 if math.isinf(self.gain) else self.gain_error / self.gain  # of the loop's size, too
         gain = self.gain / (1.0 + 2.0 * error) >= WANTED_GAIN or error <= SURE_GAIN
@@ -159,7 +159,7 @@ def _margins(loop: np.ndarray, error: np.ndarray) -> Measured:
         return NOTHING
     least, k = min((_between(size, phase, k, 0.0), k) for k in cross.tolist())
     phase_error = error[k] * _lever(size, phase, k)
-    clear = error <= UNCLEAR  # the others are noise: what they hide is small, or it would show
+    clear = error <= UNCLEAR  # the others are noise; a large response would show above it
     turn = np.flatnonzero((phase[:-1] > -np.pi) & (phase[1:] <= -np.pi) & clear[:-1] & clear[1:])
     top = size[np.flatnonzero(clear)[-1]] if clear.any() else 0.0
     if len(turn):
@@ -187,10 +187,11 @@ def disagreement(
     period_s: float,
     average: int = 1,
 ) -> str:
-    """Return how a measured loop contradicts its prediction on the fitted model and its pessimist; '' if it does not.
+    """Return how a measured loop contradicts its prediction; '' if it does not.
 
-    It does where a margin is smaller, by its standard error, than on the worse of both models, and where it is
-    not known well enough to tell. Of a gain margin more than twice the wanted one is not asked."""
+    models: the fitted one and its pessimist. A margin contradicts that is smaller, by its standard error,
+    than on the worse of both models, or not known well enough. A gain margin of twice the wanted one always
+    agrees."""
     if not measured.is_sure:
         return (
             f"the margins are not known well enough ({measured}): at most +- {SURE_DEG:g} deg and +- {100 * SURE_GAIN:g} % were "

@@ -19,10 +19,9 @@ Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags tha
 A loop without derivative stays without: PI by the half rule, t1 + t2/2 and theta + t2/2.
 
 Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
-moving average. A recording cannot tell a short lag from dead time, and a loop that is faster than the one of
-the recording depends on which it is. So a proposal has its margins on two models: the fitted one, and
-`pessimist`, where the short lag is dead time, and where half a command period, the ticks' jitter and the
-phase's uncertainty are more dead time.
+moving average. A recording cannot tell a short lag from dead time, and a faster loop depends on which it is.
+So a proposal has its margins on two models, the fitted one and `pessimist`. In that one the short lag is dead
+time. Half a command period, the ticks' jitter and the phase's uncertainty are more dead time.
 """
 
 from __future__ import annotations
@@ -39,14 +38,16 @@ from scipy import optimize, signal
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
-UNCERTAIN_DEG = 40.0  # no gains are proposed when the phase near the crossover has a larger standard error; a smaller one is dead time
+# No gains are proposed when the phase near the crossover has a larger standard error. A smaller one counts as
+# dead time.
+UNCERTAIN_DEG = 40.0
 ANSWERS = 10.0  # least gain of the response in its standard errors: a fit of noise reaches 5
 WANTED_DEG, WANTED_GAIN = 45.0, 2.0  # least phase margin and gain margin of a proposal
 # Largest change of a gain in one proposal. The recording was made with the present loop, whose motion hardly
 # reaches the frequencies at which a loop several times faster has its margins.
 FACTOR = 3.0
-# Largest change of a gain in one step on the rig: less than WANTED_GAIN, so that a loop that has just shown
-# its margins does not become unstable by one step.
+# Largest change of a gain in one step on the rig. It is less than WANTED_GAIN: a loop that has just shown its
+# margins does not become unstable by one step.
 STEP = 1.5
 TURNS = 3.0  # a loop's phase passes 180 deg at about this multiple of its crossover
 SHORTEST_S = 1e-6  # lag in the place of none
@@ -340,7 +341,7 @@ def robust(
 
 
 def within_factor(present: Gains, wanted: Gains, factor: float = FACTOR) -> Gains:
-    """Return the wanted gains, each at most `factor` times, and at least a `factor`-th, of the present one."""
+    """Return the wanted gains, each within a `factor` of the present one."""
     kp, ti, td = (
         min(max(b, a / factor), a * factor) if a > 0.0 else b
         for a, b in zip(_three(present), _three(wanted), strict=True)
@@ -365,10 +366,10 @@ def way(present: Gains, proposed: Gains) -> list[Gains]:
 def propose(
     models: Sequence[SecondOrder], present: Gains, wanted: Gains, period_s: float, moving_average: int = 1
 ) -> list[Gains]:
-    """Return the steps from the present gains towards the wanted ones, at most FACTOR away; the last is the proposal.
+    """Return the steps from the present gains towards the wanted ones; the last is the proposal.
 
-    Each step has the wanted margins on all models, or no smaller ones than the present gains; its kp is
-    lowered where it must be. Raises InputError where that does not help."""
+    No gain leaves FACTOR. Each step has the wanted margins on all models, or no smaller ones than the present
+    gains; its kp is lowered where it must be. Raises InputError where that does not help."""
     least = min(1.0, share_of_margins(models, present, period_s, moving_average))
     target = _slower(models, present, within_factor(present, wanted), 1.0, period_s, moving_average)
     return [

@@ -93,7 +93,7 @@ RESUMED: 1 when the law started with the estimates of an earlier run.
 BEATS = 8
 """First index in `counters` of the helpers' round counts; the supervisor detects one that hangs."""
 TRIAL = 15
-"""Index in `counters`: 1 while the loop has gains that a command tries, and not those of the configuration."""
+"""Index in `counters`: 1 while the loop has gains that a command tries."""
 
 
 def _layout(row: Row) -> int:
