@@ -1,8 +1,10 @@
 """What is shown is true: a sensor that dies is shown as dead within its stale time, in every view; causes stand first."""
 
+import dataclasses
 import json
 import math
 import os
+import re
 from collections import deque
 from io import StringIO
 from pathlib import Path
@@ -21,6 +23,7 @@ from thermoctl.daemon.answers.display import fault_lines
 from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.journal import Watcher
+from thermoctl.daemon.tick.shared import NO_MODEL
 from thermoctl.daemon.views import dashboard, monitor
 from thermoctl.daemon.views.metrics import metrics
 from thermoctl.recording.commands import list_recordings
@@ -28,7 +31,7 @@ from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.rig.channels import CHANNELS
 from thermoctl.rig.signals import INDEX, POINTS, SIGNALS
-from thermoctl_hal.base.backend import ERROR, OK, ROLE, STALE
+from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, STALE
 from thermoctl_hal.can.drive_errors import describe
 
 SENSORS = (
@@ -401,3 +404,56 @@ def test_the_rigs_own_daemon_says_so_in_its_recording(settings):
         assert paths and {rig_of(p) for p in paths} == {"simulated"}
     finally:
         running.remove()
+
+
+def test_the_monitor_at_80x24_shows_values_beside_three_faults(running):
+    """Before, the faults' text filled the screen (review_user_3 C6)."""
+    running.arm()
+    running.backend.broken.update(("coil_c", "voltage_v", "position_um"))
+    running.tick(60)
+    now = {"ok": True, **status(running.shared)}
+    assert len(now["faults"]) >= 3
+    console = Console(file=StringIO(), width=80, height=24, record=True)
+    trails: dict[str, deque[float]] = {}
+    monitor.remember(trails, now)
+    latency = Commands(running.shared, running.settings, None, lambda *a, **k: None).answer(
+        b'{"command": "latency"}', ""
+    )
+    console.print(monitor.screen(now, latency, trails, 80, monitor.BLOCKS, 24))
+    lines = console.export_text().splitlines()
+    assert len(lines) <= 24, len(lines)
+    assert any(line.startswith("fault ") for line in lines) and any("->" in line for line in lines)
+    for label in ("setpoint", "compensation", "drive", "air", "shaft 1"):
+        assert any(label in line for line in lines), (label, lines)
+
+
+class WithoutReference(Silent):
+    """A rig to which no second encoder is bound."""
+
+    def read(self, now_s):
+        sample = self.inner.read(now_s)
+        k = ROLE["output_reference_um"]
+        sample.status[k], sample.fresh[k], sample.value[k] = ABSENT, False, math.nan
+        return sample
+
+
+@pytest.mark.parametrize("model", [True, False])
+def test_nothing_measured_is_called_so_in_every_view_of_the_terminal(settings, capsys, monkeypatch, model):
+    compensation = settings.compensation if model else dataclasses.replace(settings.compensation, model="")
+    running = Running(dataclasses.replace(settings, compensation=compensation))
+    try:
+        running.shared.counters[NO_MODEL] = float(not model)
+        running.rig.backend = WithoutReference(running.backend)
+        running.arm()
+        running.tick(50)
+        printed, plain, screen, _ = in_the_terminal(running, capsys, monkeypatch)
+        if model:
+            assert plain["output_is"] == "expected, not measured"
+            assert "um (expected, not measured)" in printed and "expected, not measured" in screen
+        else:
+            assert plain["output_is"].startswith("unknown") and set(plain["estimates_c"].values()) == {None}
+            assert plain["estimates_state"] == "NONE" and plain["expansion_um"] is None
+            assert re.search(r"^coil +[\d.]+ +- ", printed, re.MULTILINE), printed
+            assert re.search(r"error with it +- +um", screen), screen
+    finally:
+        running.close()

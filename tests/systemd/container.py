@@ -26,7 +26,7 @@ PACKAGES = (
 CHECKOUT = "/srv/thermoctl"
 PROGRAM = """#!/usr/bin/python3
 import sys
-sys.path[:0] = ["{checkout}", "{checkout}/.venv/lib/python{version}/site-packages"]
+sys.path[:0] = ["{checkout}", "{checkout}/hal", "{checkout}/.venv/lib/python{version}/site-packages"]
 from thermoctl.cli import main
 sys.exit(main())
 """

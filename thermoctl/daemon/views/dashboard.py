@@ -56,6 +56,7 @@ from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")
 MAX_HEAD, MAX_BODY = 8192, 1024  # bytes of a request
+FIRST_LOOK_S = 10.0
 MAX_CONNECTIONS, MAX_STREAMS = 32, 12
 REQUEST_S, SEND_S = 5.0, 5.0  # time limits of receiving a request and of sending an answer
 COMMANDS = ("arm", "disarm", "setpoint")
@@ -233,6 +234,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             self._head(HTTPStatus.OK, "text/event-stream", None)
             watch, seen, told = self.server.watch, -1, -math.inf
+            watch.wait(0, FIRST_LOOK_S)  # it reads the last recorded minute where no daemon runs
             self.wfile.write(f"event: past\ndata: {_dump(list(watch.past))}\n\n".encode())
             while not watch.stopping:
                 seen, frame = watch.wait(seen, 1.0)

@@ -116,9 +116,14 @@ def screen(
     both = Table.grid(padding=(0, 3))
     numbers, temperatures = _numbers(status), _temperatures(status)
     both.add_row(numbers, temperatures)
-    left = height - 1 - max(numbers.row_count, temperatures.row_count + 1) if height else None
+    is_measured = status["output_is"] == MEASURED
+    origin = (
+        [] if is_measured else [Text(f"error with and without compensation: {status['output_is']}", "yellow")]
+    )
+    rows = max(numbers.row_count, temperatures.row_count + 1) + len(origin)
+    left = height - 1 - rows if height else None
     faults = _fitting(faults, width, left, FEWEST)
-    parts: list[RenderableType] = [head, *faults, *([] if faults and height else [Text()]), both]
+    parts: list[RenderableType] = [head, *faults, *([] if faults and height else [Text()]), both, *origin]
     left = None if left is None else left - max(1, len(faults))
     below: list[RenderableType] = [Text(), _trails(trails, width, ramp)]
     if latency is not None:
@@ -176,8 +181,6 @@ def _numbers(status: dict[str, Any]) -> Table:
     ):
         uncorrected = label in ("expansion", "compensation") and status["estimates_state"] == FREE
         table.add_row(f"{label} (?)" if uncorrected else label, _value(status, label, value), unit)
-    if status["output_is"] != MEASURED:
-        table.add_row("errors are", Text(status["output_is"].partition(":")[0], style="yellow"), "")
     return table
 
 
