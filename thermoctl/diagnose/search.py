@@ -75,6 +75,7 @@ class Search:
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
     norms: list[Norms] = field(default_factory=list)  # of the screening without effects
+    refitted: set[Keys] = field(default_factory=set)  # extensions, kept or not: none is refitted twice
 
     @property
     def best(self) -> Weighed:
@@ -100,7 +101,7 @@ class Search:
         looked = screened(self.case, parent.fitted, self.limits)
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
-        found = extensions(self.case, parent, looked, self.where, self.limits, self.tried)
+        found = extensions(self, parent, looked)
         self.keep(found)
         return found
 
@@ -112,16 +113,19 @@ class Search:
 def search(case: Case, limits: Limits) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
-    A rig that drifts far is searched with an observer first. Wrong numbers of the plant file are rivals."""
+    Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
+    searched with an observer, too."""
     s = started(case, limits)
     null = s.best
-    with_observer(s)
     rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
     if rivals:
         s.keep(rivals)
         s.extended(null)  # also where a rival fits better
     grow(s)
     swap(s)
+    if with_observer(s):
+        grow(s)
+        swap(s)
     return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent, s.norms)
 
 
@@ -214,21 +218,23 @@ def remade(
         return None
 
 
-def with_observer(s: Search) -> None:
+def with_observer(s: Search) -> bool:
     """Search with a plant that follows its recordings, and refit its best hypotheses in the free run.
 
-    Only for a rig that drifts: there a free run from a wrong hypothesis leads no refit to the right one."""
+    Only for a rig that drifts: there a free run from a wrong hypothesis leads no refit to the right one.
+    Return whether a hypothesis was found that the search had not."""
     case = s.case
     drives = case.drives(case.null.model)
     about = linear(case.null, drives)
     if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
-        return
+        return False
     if only_noise(case, as_refitted(case, s.best.fitted), s.limits):
-        return
+        return False
+    known = len(s.tried)
     for trust in TRUSTS:
         plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
         if plant is None:
-            return
+            break
         model = compile_plant(plant)
         null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
         budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
@@ -241,8 +247,9 @@ def with_observer(s: Search) -> None:
             free = rebuilt(s, effects, w.fitted, None) if effects else None
             if free and not free.fitted.absent:
                 s.keep([free])
-        if s.best.fitted.hypothesis.effects:
-            return
+        if len(s.tried) > known:
+            break
+    return len(s.tried) > known
 
 
 def recall(s: Search) -> None:
@@ -270,32 +277,36 @@ def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
     return list(out.values())[: limits.beam]
 
 
-def extensions(
-    case: Case,
-    parent: Weighed,
-    looked: Screened,
-    where: Mapping[str, set[str]],
-    limits: Limits,
-    tried: Mapping[Keys, Weighed],
-) -> list[Weighed]:
-    """Refit the parent with each direction, and with each pair of directions, of the shortlist."""
+def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
+    """Refit the parent with each direction, and with each pair of directions, of the shortlist.
+
+    A promise is the first-order gain. An extension that would not reach the leader with twice its promise is
+    left out. Beside a leader that leaves no more than noise, its promise counts once."""
+    case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
-    ahead = max(tried.values(), key=lambda w: w.score)
-    # beside a hypothesis that leaves no more than noise only promises count
-    promised = parent is not ahead and only_noise(case, ahead.fitted, limits)
+    quiet: dict[Keys, bool] = {}  # does a leader leave no more than noise?
     queue, planned = shortlist(looked, where, limits), case.budget.later
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
         added, gain = item
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or len(keys) > limits.effects:
+        if keys in tried or keys in s.refitted or len(keys) > limits.effects:
             return False
-        if parent.score + HALF * gain < ahead.score or promised and np.isinf(gain):
+        ahead = max([*tried.values(), *out], key=lambda w: w.score)
+        own = ahead.fitted.hypothesis.keys
+        if own not in quiet:
+            quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
+        if quiet[own] and (np.isinf(gain) or parent.score + gain < ahead.score):
+            return False
+        if parent.score + HALF * gain < ahead.score:
             return False
         case.budget.untried += case.budget.spent
-        return not case.budget.spent
+        if case.budget.spent:
+            return False
+        s.refitted.add(keys)
+        return True
 
     for batch, left in batches(queue, wanted):
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
