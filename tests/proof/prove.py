@@ -12,6 +12,7 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from tests.proof.page import page
 from tests.proof.score import Row, plain, score
 from tests.proof.summary import summary
 from thermoctl import __version__
-from thermoctl.fleet.batch import OnCase, run_all
+from thermoctl.fleet.batch import OnCase, run_all, run_one
 from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.recording.files import read_table
 from thermoctl.safe_file import whole_files, write_text
@@ -41,7 +42,7 @@ def prove(
     OUT/summary.json is the same without the cases, to be kept with a commit; OUT/proof.html is for people."""
     out = Path(out_dir)
     jobs = find_jobs(cases, number)
-    run_all(jobs, out / "cases", scheduler, workers, progress=progress)
+    run_all(jobs, out / "cases", scheduler, workers, partial(run_one, report=False), progress)
     sealed = read_answers(jobs, Path(answers) if answers is not None else None)
     rows = [_scored(job, out / "cases", sealed[job.name]) for job in jobs]
     figures = {

@@ -51,7 +51,7 @@ def diagnose(
     searched = search(known, numbers)
     say("measuring what the findings are worth")
     found = _decided(known, searched, numbers, reserve, stopped() and bool(known.budget.untried))
-    if found.decision.verdict != "consistent" and found.before.node:
+    if found.decision.verdict != "consistent" and not found.shown and found.before.node:
         found = replace(found, missing_flow=missing_flow(known, found.null, found.before.node))
     if (
         found.decision.verdict not in WITHOUT_REMAINDER

@@ -46,7 +46,7 @@ class Diagnosis:
       probability of being physics
     - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
     - `laws`: scores of hypotheses with an unknown law in the place of an effect
-    - `missing_flow`: rms of the flow into `before.node` that would close the misfit of `null`
+    - `missing_flow`: rms of the flow into `before.node` that would close the misfit, where nothing is shown
     - `law`: a law for the remainder of the outcome"""
 
     case: Case

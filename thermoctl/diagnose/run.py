@@ -53,6 +53,7 @@ def diagnose(
     limits: Limits = NONE,
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
+    report: bool = True,
 ) -> dict[str, Any]:
     """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
 
@@ -62,6 +63,7 @@ def diagnose(
     - `limits`: ranges of inputs and outputs in the next experiment
     - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
+    - `report`: write report.html, too
 
     Raises InputError for unusable inputs."""
     if not tables:
@@ -91,17 +93,20 @@ def diagnose(
         result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
     result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
     result["seconds"] = round(time.monotonic() - started, 1)
-    _write(folder, plant, found, result, proposed)
+    _write(folder, plant, found, result, proposed, report)
     return result
 
 
-def _write(folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any) -> None:
+def _write(
+    folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any, report: bool
+) -> None:
     """Write all files of a result, or none."""
     with whole_files(folder, remove=experiment_file.FILES) as part:
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
         save(found.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
-        _report(found, result, part / "report.html")
+        if report:
+            _report(found, result, part / "report.html")
         write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         memory.write(part, plant, _remembered(found))
         if proposed:
@@ -137,10 +142,12 @@ def diagnose_files(
     out: str | Path,
     effects: Sequence[Path] = (),
     held_out: Sequence[str | Path] = (),
+    report: bool = True,
 ) -> dict[str, Any]:
     """Diagnose recordings that are named by their files. Raises InputError."""
     plant = load(plant_file)
-    return diagnose(plant, read_recordings(plant, recordings), out, effects, read_recordings(plant, held_out))
+    tables, reserve = read_recordings(plant, recordings), read_recordings(plant, held_out)
+    return diagnose(plant, tables, out, effects, reserve, report=report)
 
 
 def writable(folder: Path) -> Path:
