@@ -115,8 +115,8 @@ bench-scale: develop               # cost of a diagnosis by rows; BEFORE=a check
 	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
 
 .PHONY: bench-parts
-bench-parts: develop               # where the time of a diagnosis goes, by parts; CASES= folders with plant.yaml and run_*.csv
-	$(BIN)/python -m tests.bench.parts $(CASES)
+bench-parts: develop               # where the time of a diagnosis goes, by family and stage; CASES= folders of cases; BEFORE= another checkout
+	$(BIN)/python -m tests.bench.parts $(if $(BEFORE),--before $(BEFORE)) $(CASES)
 
 .PHONY: bench-bodies bench-recordings
 bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
