@@ -17,7 +17,7 @@ from pathlib import Path
 
 from thermoctl import __version__
 from thermoctl.configuration.settings import Settings, effective
-from thermoctl.daemon.service import log_path
+from thermoctl.daemon.service import journal, log_path
 from thermoctl.recording.reader import export, info
 from thermoctl.recording.writer import FULL, recording_files
 from thermoctl.safe_file import whole_file
@@ -57,9 +57,9 @@ def report(settings: Settings, out: str, seconds: float) -> int:
     }
     log, missing = log_path(settings), []
     try:
-        files["log.txt"] = without_secrets(_tail(log))
+        files["log.txt"] = without_secrets(journal(settings, LOG_BYTES) or _tail(log))
     except OSError:
-        missing.append(f"no log: {log} does not exist; a service's log is in `journalctl -u thermoctl`")
+        missing.append(f"no log: {log} does not exist, and no service runs this configuration")
     folder = Path(settings.recording.directory)
     newest = _newest(recording_files(folder, FULL) if folder.is_dir() else [])
     if newest is None:

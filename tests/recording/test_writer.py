@@ -207,3 +207,40 @@ def test_a_place_that_cannot_be_written_is_said_not_raised(tmp_path):
     writer = RecordingWriter(settings(tmp_path / "file" / "below"), {}, log=said.append)
     assert feed(writer, ticks(1002)) + writer.close() == 1002
     assert len(said) == 1 and "Not a directory" in said[0]
+
+
+def test_a_full_disk_deletes_nothing_and_leaves_no_empty_file(tmp_path, monkeypatch):
+    feed(old := RecordingWriter(settings(tmp_path), {}), ticks(1002))
+    old.close()
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    said, clock = [], SimpleNamespace(now=0.0)
+    real = os.write
+
+    def full(fd, data):
+        if len(data) > room[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        room[0] -= len(data)
+        return real(fd, data)
+
+    monkeypatch.setattr(writing.os, "write", full)
+    for room in ([0], [40_000]):  # no room for the beginning; room for the beginning, none for the rows
+        for again in range(3):
+            writer = RecordingWriter(settings(tmp_path), {}, log=said.append, clock=lambda: clock.now)
+            assert feed(writer, ticks(1002, 2000 + again)) + writer.close() == 1002
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+    assert set(said) == {f"{tmp_path}: No space left on device"}
+
+
+def test_a_recording_is_readable_from_its_first_moment_and_names_the_time(tmp_path):
+    writer = RecordingWriter(settings(tmp_path), {}, wall=lambda: 1.75e9)
+    assert open_stream(writer.path).schema.metadata[b"begins"] == b"2025-06-15T15:06:40.000+00:00"
+    writer.close()
+
+
+def test_a_recording_that_was_deleted_is_not_written_on(tmp_path):
+    said = []
+    writer = RecordingWriter(settings(tmp_path), {}, log=said.append)
+    assert feed(writer, ticks(1002)) == 0 and said == [""]
+    writer.path.unlink()
+    assert feed(writer, ticks(1002, 1002)) > 0
+    assert writer.close() >= 0 and said[1] == f"{tmp_path}: No such file or directory"

@@ -74,6 +74,16 @@ def _unit_of(pid: int) -> str | None:
     return found[1] if found else None
 
 
+def journal(settings: Settings, size: int) -> str:
+    """Return the end of the log of the unit that runs this configuration, at most `size` bytes; '' without one."""
+    unit = _unit_for(settings)
+    if unit is None or shutil.which("journalctl") is None:
+        return ""
+    command = ["journalctl", "-u", unit, "-o", "cat", "--no-pager", "-n", "20000"]
+    done = subprocess.run(command, capture_output=True, check=False)
+    return done.stdout[-size:].decode(errors="replace")
+
+
 def start(settings: Settings) -> int:
     """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
 

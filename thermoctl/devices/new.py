@@ -32,7 +32,7 @@ def new(path: str, ask: Callable[[str], str] = input) -> int:
             Path(part).write_text(text, encoding="utf-8")
             load_profile(Path(part))
     except InputError as e:
-        raise InputError(f"{e}; nothing was written") from None
+        raise InputError(f"{str(e).replace(part, path)}; nothing was written") from None
     print(f"{target}: written. Compare it with the device: thermoctl devices probe PORT --profile {target}")
     return EXIT_OK
 

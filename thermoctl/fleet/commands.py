@@ -204,7 +204,7 @@ def live_recordings(args: argparse.Namespace) -> list[str]:
         return []
     a = alarms[-1]
     print(
-        f"The model no longer fits from {a.begin_s:.0f} s on (mean innovation {a.mean_c:+.3f} K; {span}); "
+        f"The model no longer fits from {a.begin_s:.0f} s on{live.wall_clock(table, a.begin_s)} (mean innovation {a.mean_c:+.3f} K; {span}); "
         "that is diagnosed.",
         file=sys.stderr,
     )

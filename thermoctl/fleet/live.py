@@ -7,6 +7,7 @@ written as a CSV with the columns of the thermal plant.
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,14 @@ def newest(directory: str | Path, rig: str, hours: float) -> Table:
         np.concatenate([p.t for p in parts]),
         {n: np.concatenate([p.columns[n] for p in parts]) for n in names},
     )
+
+
+def wall_clock(table: Table, t_s: float) -> str:
+    """Return the time of day in UTC at t_s of a recording, for a message; '' where it was not recorded."""
+    if "wall_s" not in table.columns:
+        return ""
+    at_s = float(np.interp(t_s, table.t, table.columns["wall_s"]))
+    return datetime.fromtimestamp(at_s, UTC).strftime(", %Y-%m-%d %H:%M:%SZ") if np.isfinite(at_s) else ""
 
 
 def alarms(settings: Settings, table: Table) -> list[Alarm]:

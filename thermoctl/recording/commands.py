@@ -75,7 +75,7 @@ def show_info(args: argparse.Namespace) -> int:
         print(json.dumps({k: None if v != v else v for k, v in dataclasses.asdict(i).items()}, indent=1))
         return 0
     print(
-        f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s, begun {_wall(i.begins_wall_s)}, "
+        f"{i.path}: {i.rows} rows, t {i.begins_s:g} to {i.ends_s:g} s, begun {_wall(i.begins_wall_s)}, ended {_wall(i.ends_wall_s)}, "
         f"{i.bytes / 1e6:.2f} MB"
         + (
             ""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from datetime import date, time
+from datetime import UTC, date, datetime, time
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +138,8 @@ def write_mdf(path: str, table: Table) -> None:
             ],
             comment=f"thermoctl recording {table.name}",
         )
+        if "wall_s" in table.columns:  # other programs then show the time of day
+            mdf.start_time = datetime.fromtimestamp(table.columns["wall_s"][0] - table.t[0], UTC)
         mdf.save(path, overwrite=True, compression=2)
 
 

@@ -32,6 +32,7 @@ class Info:
     begins_s: float  # t of the first and last row; NaN without rows
     ends_s: float
     begins_wall_s: float  # NaN where the wall clock is not recorded
+    ends_wall_s: float
     bytes: int
     readable_bytes: int
     whole: bool
@@ -47,13 +48,15 @@ def info(path: str | Path) -> Info:
     if clock is None:
         raise InputError(f"{path}: no column 't' or 't_s'; it is no recording")
     stream = open_stream(path, [clock, "wall_s"])
-    rows, begins, ends, wall = 0, np.nan, np.nan, np.nan
+    rows, begins, ends, wall, wall_end = 0, np.nan, np.nan, np.nan, np.nan
     for batch in stream:
         if batch.num_rows:
             t = batch.column(clock)
             if not rows:
                 begins = t[0].as_py()
                 wall = batch.column("wall_s")[0].as_py() if "wall_s" in batch.schema.names else np.nan
+            if "wall_s" in batch.schema.names:
+                wall_end = batch.column("wall_s")[-1].as_py()
             rows, ends = rows + batch.num_rows, t[-1].as_py()
     said = {f.name: f.metadata or {} for f in fields}
     columns = tuple(
@@ -69,6 +72,7 @@ def info(path: str | Path) -> Info:
         begins,
         ends,
         wall,
+        wall_end,
         path.stat().st_size,
         stream.good_bytes,
         stream.whole,

@@ -60,8 +60,7 @@ class StreamFile:
         self._fd, part = part_file(path)
         try:
             self._stream = pa.ipc.new_stream(self._buffer, columns, options=_COMPRESSED)
-            self._stream.write_table(columns.empty_table())  # writes the schema message
-            self._put()
+            self._append(np.empty((0, len(columns))))  # pyarrow writes the schema with the first batch
             os.replace(part, path)
             sync_folder(path.parent)
         except OSError:
@@ -73,12 +72,15 @@ class StreamFile:
 
     def write(self, rows: np.ndarray) -> None:
         """Append rows (k, columns) as one batch."""
+        self._append(rows)
+        self.rows += len(rows)
+
+    def _append(self, rows: np.ndarray) -> None:
         batch = pa.RecordBatch.from_arrays(
             [pa.array(column) for column in np.ascontiguousarray(rows.T)], schema=self.schema
         )
         self._stream.write_batch(batch, custom_metadata={CRC: checksums(batch)})
         self._put()
-        self.rows += len(rows)
 
     def _put(self) -> None:
         data = self._buffer.getvalue()
@@ -194,7 +196,7 @@ class RecordingWriter:
     When it is `full`, close it and open the next.
 
     - settings: folder, sizes and budgets
-    - metadata: configuration, model and law, written into the files
+    - metadata: configuration, model and law, written into the files, beside `begins`: the wall clock
     - log(text): called with the reason when the disk fails, and with '' once rows are on the disk
     - `error`: the reason why nothing is recorded, '' when it is"""
 
@@ -306,7 +308,10 @@ class RecordingWriter:
 
     def _open(self) -> None:
         rig, full, tier, wall = self._files_of
-        stamp = datetime.fromtimestamp(wall(), UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
+        now = datetime.fromtimestamp(wall(), UTC)
+        stamp = now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
+        begins = {"begins": now.isoformat(timespec="milliseconds")}
+        full, tier = (s.with_metadata({**s.metadata, **begins}) for s in (full, tier))
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             for again in ("", *(f"-{i}" for i in range(1, 1000))):

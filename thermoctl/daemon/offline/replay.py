@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -111,7 +112,11 @@ def command(recording: str) -> int:
         + f"; rig {meta.get('rig', 'unknown')}, run {meta.get('run', 'unknown')}"
     )
     for name, (count, first, largest) in result.differences.items():
-        print(f"  {name}: differs in {count} ticks, first in tick {first}, by at most {largest:g}")
+        row = rows[np.searchsorted(rows[:, AT["tick"]], first)]
+        at = datetime.fromtimestamp(row[AT["wall_s"]], UTC).isoformat(timespec="milliseconds")
+        print(
+            f"  {name}: differs in {count} ticks, first in tick {first} (t_s {row[AT['t_s']]:.3f}, {at}), by at most {largest:g}"
+        )
     if result.differences:
         return 1
     print(f"  all {np.size(result.outputs)} outputs are the recorded ones, bit for bit")
