@@ -120,12 +120,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parsed(parser(), sys.argv[1:] if argv is None else argv)
     try:
         which_rig.choose(args)
-        return call(args.row, args)
+        code = call(args.row, args)
+        sys.stdout.flush()  # a full disk behind `> FILE` shows here
+        return code
     except InputError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         return 0
+    except OSError as e:
+        print(f"thermoctl: {e.filename or args.row.name}: {e.strerror or e}", file=sys.stderr)
+        if e.filename is None:  # stdout: the rest of its buffer must not fail once more at the end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
+        return 3
     except KeyboardInterrupt:
         return 130
     except ModuleNotFoundError as e:

@@ -213,7 +213,7 @@ def test_a_full_disk_deletes_nothing_and_leaves_no_empty_file(tmp_path, monkeypa
     feed(old := RecordingWriter(settings(tmp_path), {}), ticks(1002))
     old.close()
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
-    said, clock = [], SimpleNamespace(now=0.0)
+    said, clock, room = [], SimpleNamespace(now=0.0), [0]
     real = os.write
 
     def full(fd, data):
@@ -223,7 +223,8 @@ def test_a_full_disk_deletes_nothing_and_leaves_no_empty_file(tmp_path, monkeypa
         return real(fd, data)
 
     monkeypatch.setattr(writing.os, "write", full)
-    for room in ([0], [40_000]):  # no room for the beginning; room for the beginning, none for the rows
+    for size in (0, 40_000):  # no room for the beginning; room for the beginning, none for the rows
+        room[0] = size
         for again in range(3):
             writer = RecordingWriter(settings(tmp_path), {}, log=said.append, clock=lambda: clock.now)
             assert feed(writer, ticks(1002, 2000 + again)) + writer.close() == 1002

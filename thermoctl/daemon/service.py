@@ -75,7 +75,7 @@ def _unit_of(pid: int) -> str | None:
 
 
 def journal(settings: Settings, size: int) -> str:
-    """Return the end of the log of the unit that runs this configuration, at most `size` bytes; '' without one."""
+    """Return at most `size` last bytes of the log of this configuration's unit; '' without a unit."""
     unit = _unit_for(settings)
     if unit is None or shutil.which("journalctl") is None:
         return ""

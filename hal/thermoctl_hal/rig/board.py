@@ -57,7 +57,7 @@ class Board:
         path.unlink(missing_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
-            os.ftruncate(fd, size)
+            os.posix_fallocate(fd, 0, size)  # where memory is lacking: an error now, no SIGBUS later
             return cls(mmap.mmap(fd, size), path, True)
         finally:
             os.close(fd)
