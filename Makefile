@@ -212,6 +212,11 @@ same-cases: develop                # cases of every family by the compiled loops
 demo-concealed: develop            # seven hidden effects on independently simulated rigs: diagnosed, modelled, compensated
 	$(BIN)/python -m tests.concealed.demo
 
+.PHONY: disk
+disk: develop                      # every writer under every I/O error at every call, on tmpfs and ext4: docs/proof/disk.md; root, minutes
+	$(BIN)/python -m tests.disk.run --page docs/proof/disk.md
+	$(BIN)/python -m pytest -q -m slow tests/disk
+
 .PHONY: hazards
 hazards: develop                   # every hazard with its limit; measured results in docs/proof/hazards.md
 	THERMOCTL_HAZARDS=docs/proof/hazards.md $(BIN)/python -m pytest -m "slow or not slow" tests/hazards

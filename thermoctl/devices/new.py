@@ -27,12 +27,12 @@ def new(path: str, ask: Callable[[str], str] = input) -> int:
         text = _text(ask)
     except EOFError:
         raise InputError(f"{target}: not written, the answers ended early") from None
-    try:
-        with whole_file(target) as part:
-            Path(part).write_text(text, encoding="utf-8")
+    with whole_file(target) as part:
+        Path(part).write_text(text, encoding="utf-8")
+        try:
             load_profile(Path(part))
-    except InputError as e:
-        raise InputError(f"{str(e).replace(part, path)}; nothing was written") from None
+        except InputError as e:
+            raise InputError(f"{str(e).replace(part, path)}; nothing was written") from None
     print(f"{target}: written. Compare it with the device: thermoctl devices probe PORT --profile {target}")
     return EXIT_OK
 

@@ -79,18 +79,14 @@ def write_table(path: str | Path, table: Table) -> None:
     if kind not in (".csv", ".parquet", ".arrow"):
         raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
     arrow = to_arrow(table)
-    with whole_file(path) as temporary:
+    with whole_file(path) as temporary, open(temporary, "wb") as f:
         if kind == ".csv":
-            pa.csv.write_csv(arrow, temporary, pa.csv.WriteOptions(quoting_style="needed"))
+            pa.csv.write_csv(arrow, f, pa.csv.WriteOptions(quoting_style="needed"))
         elif kind == ".parquet":
-            pa.parquet.write_table(arrow, temporary, compression="zstd")
+            pa.parquet.write_table(arrow, f, compression="zstd")
         else:
-            with (
-                pa.OSFile(temporary, "wb") as f,
-                pa.ipc.new_file(
-                    f, arrow.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
-                ) as writer,
-            ):
+            options = pa.ipc.IpcWriteOptions(compression="zstd")
+            with pa.ipc.new_file(f, arrow.schema, options=options) as writer:
                 writer.write_table(arrow)
 
 

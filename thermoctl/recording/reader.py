@@ -165,10 +165,12 @@ def _export_table(
         with TemporaryDirectory() as folder:  # asammdf requires its own suffix
             formats.write_mdf(f"{folder}/export.mf4", table)
             shutil.copyfile(f"{folder}/export.mf4", out)
-    elif kind == ".csv":
-        pa.csv.write_csv(to_arrow(table), out)
     else:
-        pa.parquet.write_table(to_arrow(table), out, compression="zstd")
+        with open(out, "wb") as f:
+            if kind == ".csv":
+                pa.csv.write_csv(to_arrow(table), f)
+            else:
+                pa.parquet.write_table(to_arrow(table), f, compression="zstd")
     return len(table)
 
 
@@ -185,10 +187,11 @@ def _export_stream(
     clock = "t" if "t" in stream.schema.names else "t_s"
     rows = 0
     with ExitStack() as stack:
+        f = stack.enter_context(open(out, "wb"))
         writer = stack.enter_context(
-            pa.csv.CSVWriter(out, stream.schema)
+            pa.csv.CSVWriter(f, stream.schema)
             if kind == ".csv"
-            else pa.parquet.ParquetWriter(out, stream.schema, compression="zstd")
+            else pa.parquet.ParquetWriter(f, stream.schema, compression="zstd")
         )
         for piece in _pieces(stream, clock, begin_s, end_s):
             writer.write_table(piece)

@@ -275,7 +275,7 @@ class RecordingWriter:
         try:
             self._tier_rows.append(self._tier.add(rows))
             self._flush_tier(TIER_BATCH_ROWS)
-            if self._full_file.bytes - self._pruned_at > self.budget / 64:
+            if not self._working or self._full_file.bytes - self._pruned_at > self.budget / 64:
                 self._prune()
         except OSError as e:
             self._fail(e)
@@ -322,7 +322,8 @@ class RecordingWriter:
                 except FileExistsError:
                     continue
             self._tier_file = StreamFile(stem.with_name(stem.name + TIER), tier)
-            self._prune()
+            prune(self.directory, FULL, self.budget + self._full_file.bytes, self.path)
+            prune(self.directory, TIER, self.tier_budget + self._tier_file.bytes, self._tier_file.path)
         except OSError as e:
             self._fail(e)
 
