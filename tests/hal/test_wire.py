@@ -10,6 +10,9 @@ import time
 
 import pytest
 
+from tests.hal.conftest import CONFIG
+from thermoctl.configuration.settings import load_settings
+from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import (
     ABSENT,
     AMP_DISABLED,
@@ -26,7 +29,7 @@ from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.make import make_backend, make_devices
 from thermoctl_hal.rig.poller import poll_until
 from thermoctl_hal.virtual.drive import HEARTBEAT_LOST
-from thermoctl_hal.virtual.rig import tell
+from thermoctl_hal.virtual.rig import VirtualRig, tell
 
 POSITION, COIL, AIR, VOLTAGE, CURRENT = (
     ROLE[r] for r in ("position_um", "coil_c", "air_c", "voltage_v", "current_a")
@@ -274,7 +277,8 @@ def test_control_socket_answers_nonsense_plainly(wire):
     assert "is none of" in tell(path, "encoder explode")
     assert "on or off was expected" in tell(path, "encoder freeze maybe")
     assert "error code" in tell(path, "drive fault x")
-    assert "encoder plug|unplug" in tell(path, "help")
+    said = tell(path, "help")
+    assert "encoder plug|unplug" in said and "mute on/off" in said and "open CHANNEL" in said, said
 
 
 def test_the_reference_is_recorded_with_a_time_that_the_daemon_shares(wire):
@@ -311,3 +315,12 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
         open_port(os.ttyname(slave), LineSettings())
     os.close(master)
     os.close(slave)
+
+
+def test_a_rig_without_a_plant_is_told_what_the_virtual_rig_needs(tmp_path):
+    """Before: `thermoctl: .: cannot be read: Is a directory` (review_user_3 A6)."""
+    path = tmp_path / "rig.yaml"
+    text = re.sub(r"(profile: |model: )(\w+/)", rf"\g<1>{CONFIG}/\g<2>", (CONFIG / "wire.yaml").read_text())
+    path.write_text(re.sub(r"  plant: .*\n", "", text))
+    with pytest.raises(InputError, match=r"rig.yaml: hal.plant is missing: .*outputs carry the roles' names"):
+        VirtualRig(load_settings(path))

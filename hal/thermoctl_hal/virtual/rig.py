@@ -47,6 +47,8 @@ MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant 
 REFERENCE_HZ = 100
 PRIORITY = 70  # below the daemon's loop
 OWN = ("amplifier_state", "amplifier_fault", "supply_v")  # roles that need no output of the plant
+TAKES = {"open": "CHANNEL", "close": "CHANNEL", "exception": "CODE", "fault": "CODE", "stop": "MS"}
+"""Argument of a device's command; `on/off` of the others."""
 MAX_COMMAND = 400  # bytes of a line to the control socket
 _REFERENCE = ("output_reference_um", "position_um", "coil_c", "air_c")
 _COLUMNS = (*_REFERENCE, "drive", "enabled")
@@ -200,7 +202,10 @@ class VirtualRig:
         name, _, rest = line.partition(" ")
         verb, _, argument = rest.strip().partition(" ")
         if name == "help":
-            return "; ".join(f"{d.name} plug|unplug|{'|'.join(d.verbs)}" for d in self.devices.values())
+            return "; ".join(
+                "|".join((f"{d.name} plug", "unplug", *(f"{v} {TAKES.get(v, 'on/off')}" for v in d.verbs)))
+                for d in self.devices.values()
+            )
         if name == "quit":
             self.stopping = True
             return "ok"
