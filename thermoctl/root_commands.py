@@ -290,19 +290,24 @@ def effects(args: argparse.Namespace) -> int:
         from thermoctl.advice.commands import check_effects
 
         return check_effects(args)
-    from thermoctl.diagnose import commands
+    if args.action == "save":
+        from thermoctl.diagnose.commands import save_law
+
+        return save_law(args)
+    from thermoctl.diagnose import show
 
     args.name = args.files[0] if args.files else None
-    return commands.effects(args)
+    return show.effects(args)
 
 
 def diagnose(args: argparse.Namespace) -> int:
     """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
-    from thermoctl.diagnose import commands
     from thermoctl.yamlfile import InputError
 
     if args.explain:
-        return commands.diagnose(args)
+        from thermoctl.diagnose.show import explained
+
+        return explained(args.explain)
     for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
         if not value:
             raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")
@@ -332,6 +337,8 @@ def diagnose(args: argparse.Namespace) -> int:
         from thermoctl.calibration.commands import record
 
         record(experiment, recording, args.config, args.rig, args.yes)
+
+    from thermoctl.diagnose import commands
 
     args.record = record
     return commands.diagnose(args)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
@@ -89,7 +89,7 @@ def residual_panels(e: np.ndarray, name: str, unit: str | None) -> Figure:
         axes[1, 0].plot(f, 2 * f + bound, color="#c2410c", lw=0.8, ls="--" if side else ":")
     axes[1, 0].set_ylim(0, 1)
     _titled(axes[1, 0], "cumulated periodogram", "frequency / sampling rate", "")
-    expected = norm.ppf((np.arange(len(e)) + 0.5) / len(e))
+    expected = ndtri((np.arange(len(e)) + 0.5) / len(e))
     axes[1, 1].plot(expected, np.sort(e), ".", ms=2, color="#2b6cb0")
     axes[1, 1].plot(expected, e.mean() + e.std() * expected, color="#c2410c", lw=0.8, ls="--")
     _titled(axes[1, 1], "normal quantiles", "standard normal", unit or "")

@@ -1,4 +1,4 @@
-"""The commands `diagnose` and `effects`.
+"""The command `diagnose`, and `effects save`.
 
 Progress while they work, a summary for a person, JSON for a program."""
 
@@ -21,18 +21,17 @@ from rich.table import Table
 
 from thermoctl.checks.commands import checked, report
 from thermoctl.diagnose import run
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.experiment.file import peaks
 from thermoctl.diagnose.experiment.resolve import resolve
 from thermoctl.diagnose.law.result import save_effect
-from thermoctl.diagnose.report.explain import explain
 from thermoctl.diagnose.report.words import sentences, what_next
+from thermoctl.diagnose.show import read
 from thermoctl.diagnose.workers import cluster
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.table import Table as Recording
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.yamlfile import InputError
 
 QUIET_S = 5.0  # seconds between two lines on the same stage
 
@@ -96,12 +95,9 @@ def on_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def diagnose(args: argparse.Namespace) -> int:
-    """`thermoctl diagnose`: run the diagnosis and print its summary, or explain an earlier one.
+    """`thermoctl diagnose`: run the diagnosis and print its summary.
 
     Raises InputError for unusable inputs."""
-    if args.explain:
-        print(explain(_read(Path(args.explain))))
-        return 0
     if not args.recordings:
         raise InputError("no recording was given; one or more were expected, or --live")
 
@@ -164,20 +160,6 @@ def _resolved(
     return resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
 
 
-def _read(folder: Path) -> dict[str, Any]:
-    """Read the result of an earlier diagnosis. Raises InputError."""
-    path = folder / "diagnosis.json"
-    try:
-        found = json.loads(path.read_text())
-    except OSError:
-        raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
-    except ValueError as e:
-        raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
-    if not isinstance(found, dict) or not {"decision", "hypotheses", "lost"} <= found.keys():
-        raise InputError(f"{path}: written by an older version, without its reasons; diagnose again")
-    return found
-
-
 def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
     """NAME=LOW:HIGH of each. Raises InputError."""
     out = {}
@@ -195,57 +177,15 @@ def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
     return out
 
 
-def effects(args: argparse.Namespace) -> int:
-    """`thermoctl effects [show NAME | save DIR NAME]`: list the catalogue, show an entry, save a law as one.
-
-    Raises InputError for an unknown name, and for a diagnosis without a law."""
-    if args.action == "save":
-        if len(args.files) != 2:
-            raise InputError(
-                "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
-            )
-        folder, label = args.files
-        path = save_effect(_read(Path(folder)), label, Path((args.effects or ["effects"])[0]))
-        print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
-        return 0
-    found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
-    console = Console(soft_wrap=True)
-    if args.action == "show":
-        if args.name not in found:
-            raise InputError(
-                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
-                "`thermoctl effects` lists them"
-            )
-        e = found[args.name]
-        console.print(
-            f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
-            f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
-        )
-        for number, change in enumerate(e.changes):
-            for item in change:
-                for kind, value in item.items():
-                    body = (
-                        ", ".join(f"{k}: {v}" for k, v in value.items())
-                        if isinstance(value, dict)
-                        else str(value)
-                    )
-                    console.print(
-                        f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False
-                    )
-        for p in e.parameters:
-            console.print(
-                f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}",
-                markup=False,
-            )
-        return 0
-    if args.action:
+def save_law(args: argparse.Namespace) -> int:
+    """`thermoctl effects save DIR NAME`: save the law of a diagnosis as an effect file. Raises InputError."""
+    if len(args.files) != 2:
         raise InputError(
-            f"effects: 'show NAME', 'check FILE', 'save DIR NAME' or nothing was expected, not '{args.action}'"
+            "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
         )
-    table = Table("effect", "place", "what it is", box=None, header_style="bold")
-    for e in found.values():
-        table.add_row(e.name, e.where, e.title)
-    console.print(table)
+    folder, label = args.files
+    path = save_effect(read(Path(folder)), label, Path((args.effects or ["effects"])[0]))
+    print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
     return 0
 
 

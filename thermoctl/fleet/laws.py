@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
 CHANCE = 0.05  # probability of differences as large, below which values are not the same
@@ -59,7 +59,7 @@ def _shared(term: Term, values: Mapping[str, tuple[float, float]]) -> Shared:
     mean = float(weight @ v / weight.sum())
     spread = float(weight @ (v - mean) ** 2)
     return Shared(
-        term, values, mean, float(weight.sum() ** -0.5), float(chi2.sf(spread, len(v) - 1)) >= CHANCE
+        term, values, mean, float(weight.sum() ** -0.5), float(chdtrc(len(v) - 1, spread)) >= CHANCE
     )
 
 

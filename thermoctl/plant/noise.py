@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from thermoctl.plant.refit import Fit
 from thermoctl.plant.residuals import Problem
@@ -91,6 +90,8 @@ class _Restricted:
 
     def choose(self, j: int) -> Noise:
         """Return channel j's noise of the greatest restricted likelihood; the others' noise is held."""
+        from scipy.optimize import minimize_scalar  # slow to load, and only coloured noise needs it
+
         old = self.found.noise[j]
         best = minimize_scalar(
             lambda phi: self._score(j, phi)[0],
