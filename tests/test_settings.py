@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from thermoctl.configuration import settings
+from thermoctl.identify.tuning import write_values
 from thermoctl.yamlfile import InputError
 
 SIMULATED = Path(__file__).parent.parent / "config" / "simulated.yaml"
@@ -78,3 +79,15 @@ def test_quantities_in_other_units_are_converted(tmp_path):
     s = loaded(tmp_path)
     assert s.loop.period_s == pytest.approx(1e-3, rel=1e-15)
     assert s.control.setpoint_rate_um_s == pytest.approx(1000 / 60, rel=1e-12)
+
+
+def test_a_written_value_may_bring_its_own_comment(tmp_path):
+    """Before, the comment of the old model stood beside the new one (review_user_3 C18)."""
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "compensation:\n  model: old.yaml   # thermoctl plant linearise\n  bound_um: 40  # clipped\n"
+    )
+    write_values(path, "compensation", {"model": "models  # written by calibrate", "bound_um": "30"})
+    assert path.read_text() == (
+        "compensation:\n  model: models  # written by calibrate\n  bound_um: 30  # clipped\n"
+    )
