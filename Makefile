@@ -105,6 +105,14 @@ models: install                    # the shipped compensator models, computed fr
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig simulated --out config/models/simulated.yaml --replace
 	$(BIN)/thermoctl plant linearise config/plants/actuator_thermal.yaml --rig wire --out config/models/wire.yaml --replace
 
+.PHONY: loggers fuzz-reading
+loggers: develop                   # read a file of each logger of docs/reference/loggers.md, compare every number, print the table
+	$(BIN)/python -m tests.recording.loggers
+
+READINGS ?= 10000
+fuzz-reading: develop              # tables written in any dialect, clock, unit, spelling and order: the same numbers or an error
+	THERMOCTL_READINGS=$(READINGS) $(BIN)/python -m pytest -q tests/recording/test_meaning.py
+
 .PHONY: bench
 bench: develop                     # speed of plants beside scipy and CasADi
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs

@@ -79,13 +79,35 @@ RECORDINGS = argument(
 TIME = argument(
     "--time",
     metavar="COLUMN",
-    help="the column of times (default: by its name, else the first that increases)",
+    help="the column of times (default: found by its cells, its name and unit, and that it increases)",
 )
 COLUMNS = argument(
     "--columns",
     metavar="NAME=COLUMN,...",
     help="names that the plant reads, and the recordings' columns that they stand for",
 )
+READING = (
+    TIME,
+    COLUMNS,
+    argument("--sheet", metavar="NAME", help="the sheet (Excel), group (TDMS) or variable (MATLAB) to read"),
+    argument(
+        "--missing",
+        metavar="WORD,...",
+        help="further words or numbers that mean 'no value', such as -9999 or 'not ready'",
+    ),
+    argument(
+        "--decimal",
+        choices=(".", ","),
+        help="the decimal sign, where a file's numbers can be read in two ways",
+    ),
+    argument("--run", type=int, metavar="N", help="of several runs in a file, the one to read, from 1"),
+    argument(
+        "--equal-times",
+        choices=("spread", "mean", "first", "last"),
+        help="rows of one time: spread them to the next time, or take one row",
+    ),
+)
+"""How a recording of any logger is read."""
 EFFECTS = argument(
     "--effects", action="append", metavar="DIR", help="a further folder of effect files (repeatable)"
 )

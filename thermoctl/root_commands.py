@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.command import (
-    COLUMNS,
     CONFIG,
     DIAGNOSE,
     EFFECTS,
     HELP,
     MAP,
+    READING,
     ROOT,
     RUN,
-    TIME,
     YES,
     Table,
     argument,
@@ -93,8 +92,7 @@ TABLE: Table = {
                 help="recording that takes no part in any choice and measures what the findings are worth (repeatable; "
                 "default: the last of three or more)",
             ),
-            TIME,
-            COLUMNS,
+            *READING,
             argument(
                 "--anyway",
                 action="store_true",

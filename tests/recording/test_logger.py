@@ -90,10 +90,7 @@ def test_excel(tmp_path):
 @pytest.mark.parametrize(
     "text, says",
     [
-        (
-            "t;x\n0;1,5\n1;warm\n2;3,5\n",
-            ":3: column 'x': 'warm' stands where a number with a decimal comma belongs",
-        ),
+        ("t;x\n0;1,5\n1;warm\n2;3,5\n", ":3: column 'x': 'warm' stands where a number belongs"),
         (
             "t;x\n# c\n0;1,5\n\n1;1.5\n2;3,5\n",
             ":5: column 'x': '1.5' stands where a number with a decimal comma",
@@ -101,7 +98,6 @@ def test_excel(tmp_path):
         ("t;x\n0;1,5\n1\n2;3,5\n", ":3: 1 cells; 2 as in the header were expected"),
         ("t;x\n0;1\n1;2\n1;3\n", ":4: the time 1 stands twice"),
         ("t;x\n0;1\n5;2\n1;3\n", ":4: the time 1 runs backwards from 5"),
-        ("0;1\n1;2\n", ":1: a header line with the column names was expected, found numbers"),
         ("t;x [K];x [K]\n0;1;1\n", ":1: the column 'x [K]' stands twice"),
         ("a;b\n5;1\n3;2\n", "name it with --time COLUMN"),
         (
@@ -129,8 +125,7 @@ def test_every_guess_is_said_aloud(tmp_path):
     notes = read_recording(written(tmp_path, DIALECTS["ISO"])).notes
     assert notes == (
         "separator ';'" + ", decimal comma",
-        "time taken from column 'Zeit' (another: --time COLUMN)",
-        "dates read as year-month-day, from 2026-03-14 09:26:53.000",
+        "time from 'Zeit': dates read as year-month-day, from 2026-03-14 09:26:53.000 (another: --time COLUMN)",
     )
     assert read_recording(written(tmp_path, "t,x\n0,1\n")).notes == ()
 
@@ -138,10 +133,8 @@ def test_every_guess_is_said_aloud(tmp_path):
 def test_our_own_files_go_the_old_way(tmp_path, monkeypatch):
     from thermoctl.recording import logger
 
-    monkeypatch.setattr(logger, "_read_text", None)
+    monkeypatch.setattr(logger, "_sheets", lambda *_: 1 / 0)
     assert len(read_recording(written(tmp_path, "# c\nt,x\n0,1\n1,\n"))) == 2
-    with pytest.raises(InputError, match=":3: column 'x': 'warm' stands where a number belongs"):
-        read_recording(written(tmp_path, "t,x\n0,1\n1,warm\n"))
 
 
 def test_the_time_column_by_name_and_renamed_columns(tmp_path):
@@ -150,7 +143,7 @@ def test_the_time_column_by_name_and_renamed_columns(tmp_path):
     assert table.t.tolist() == [0, 0.5] and table.units == {"heat": "kW"}
     assert {k: v.tolist() for k, v in table.columns.items()} == {"heat": [2, 4], "n": [3, 5]}
     other = read_recording(written(tmp_path, "t;clock;x\n7;0;2\n9;1;4\n", "other.csv"), "clock")
-    assert other.t.tolist() == [0, 1] and list(other.columns) == ["x"]
+    assert other.t.tolist() == [0, 1] and list(other.columns) == ["t", "x"]
     swapped = read_recording(path, "clock", {"P": "T", "T": "P"})
     assert swapped.columns["P"].tolist() == [3, 5] and swapped.columns["T"].tolist() == [2, 4]
     with pytest.raises(InputError, match=r"no column 'clok' \(did you mean 'clock'\?\)"):

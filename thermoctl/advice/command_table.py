@@ -2,19 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import (
-    COLUMNS,
-    DIAGNOSE,
-    EFFECTS,
-    JSON,
-    MAP,
-    MODEL,
-    PLANT,
-    TIME,
-    Table,
-    argument,
-    command,
-)
+from thermoctl.command import DIAGNOSE, EFFECTS, JSON, MAP, MODEL, PLANT, READING, Table, argument, command
 
 TABLE: Table = {
     MODEL: (
@@ -31,8 +19,7 @@ TABLE: Table = {
                 metavar="REC",
                 help="recordings to check with the plant; exit 1 on a severe fault",
             ),
-            TIME,
-            COLUMNS,
+            *READING,
         ),
     ),
     DIAGNOSE: (
@@ -55,8 +42,7 @@ TABLE: Table = {
                 metavar="NAME=LOW:HIGH",
                 help="range of an input that can be driven; without --like it goes through levels (repeatable)",
             ),
-            TIME,
-            COLUMNS,
+            *READING,
             EFFECTS,
             JSON,
         ),

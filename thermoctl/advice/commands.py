@@ -18,7 +18,7 @@ from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.commands import parsed_limits
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.logger import options
 from thermoctl.yamlfile import InputError
 
 
@@ -46,7 +46,7 @@ def check_effects(args: argparse.Namespace) -> int:
 def plan_experiment(args: argparse.Namespace) -> int:
     """`thermoctl plan`: print what recordings like these would show of a plant. Raises InputError."""
     plant = load(args.plant, args.map)
-    tables = read_recordings(plant, args.like or (), args.time, parsed_columns(args.columns))
+    tables = read_recordings(plant, args.like or (), **options(args))
     entries = catalogue((CATALOGUE, *map(Path, args.effects or ())))
     planned = plan(plant, tables, entries, parsed_limits(args.limit or ()))
     if args.json:

@@ -10,9 +10,9 @@ import numpy as np
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import in_plant_units
-from thermoctl.recording.dialect import split_unit
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
+from thermoctl.recording.units import split_unit
 from thermoctl.yamlfile import InputError, suggest
 
 

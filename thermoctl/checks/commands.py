@@ -11,7 +11,7 @@ from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
 from thermoctl.plant import Plant, load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.logger import options, print_notes
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -31,7 +31,7 @@ def check(args: argparse.Namespace) -> int:
             f"{len(p.flows)} flows, {len(p.outputs)} outputs"
         )
         if args.data:
-            _, found = checked(p, args.data, args.time, args.columns)
+            _, found = checked(p, args.data, args)
             report(found, sys.stdout)
             if not found:
                 print("the recordings fit the plant's labels, units and clock")
@@ -43,13 +43,11 @@ def check(args: argparse.Namespace) -> int:
 
 
 def checked(
-    plant: Plant, paths: Sequence[str], time: str | None, columns: str | None
+    plant: Plant, paths: Sequence[str], args: argparse.Namespace
 ) -> tuple[list[Table], list[Finding]]:
     """Read recordings for a plant, print the reader's notes, and return the tables and the findings."""
-    tables = read_recordings(plant, paths, time, parsed_columns(columns))
-    for table in tables:
-        for note in table.notes:
-            print(f"note: {table.path}: {note}", file=sys.stderr)
+    tables = read_recordings(plant, paths, **options(args))
+    print_notes(tables)
     return tables, checks(plant, tables)
 
 

@@ -103,8 +103,8 @@ def diagnose(args: argparse.Namespace) -> int:
 
     run.writable(Path(args.out))
     plant = load(args.plant, args.map)
-    given, found_before = checked(plant, args.recordings, args.time, args.columns)
-    held_out, found_held = checked(plant, args.held_out or (), args.time, args.columns)
+    given, found_before = checked(plant, args.recordings, args)
+    held_out, found_held = checked(plant, args.held_out or (), args)
     report([*found_before, *found_held], sys.stderr)
     if any(f.severe for f in (*found_before, *found_held)) and not args.anyway:
         raise InputError(

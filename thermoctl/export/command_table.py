@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import COLUMNS, MODEL, TIME, Table, argument, command
+from thermoctl.command import MODEL, READING, Table, argument, command
 
 TABLE: Table = {
     MODEL: (
@@ -28,8 +28,7 @@ TABLE: Table = {
                 metavar="REC",
                 help="a recording: first readings, this recording's parameters, and the widths of jumps",
             ),
-            TIME,
-            COLUMNS,
+            *READING,
         ),
     )
 }

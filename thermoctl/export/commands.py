@@ -17,7 +17,7 @@ from thermoctl.export.values import values
 from thermoctl.plant import Plant, load
 from thermoctl.plant.equations import Equations
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.logger import options
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
@@ -30,7 +30,7 @@ def export(args: argparse.Namespace) -> int:
     plant = load(args.plant)
     recording = None
     if args.data:
-        (recording,) = read_recordings(plant, [args.data], args.time, parsed_columns(args.columns))
+        (recording,) = read_recordings(plant, [args.data], **options(args))
     out = Path(args.out or Path(args.plant).with_suffix(SUFFIX[args.to]).name)
     if out.suffix != SUFFIX[args.to]:
         raise InputError(f"{out}: --to {args.to} writes a file that ends in {SUFFIX[args.to]}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import COLUMNS, MAP, MODEL, PLANT, RECORDINGS, TIME, Table, argument, command
+from thermoctl.command import MAP, MODEL, PLANT, READING, RECORDINGS, Table, argument, command
 
 TABLE: Table = {
     MODEL: (
@@ -25,8 +25,7 @@ TABLE: Table = {
             argument(
                 "--outputs", metavar="A,B", help="columns of sensors, in the same way (default: by kind)"
             ),
-            TIME,
-            COLUMNS,
+            *READING,
             argument(
                 "--template",
                 metavar="NAME",
@@ -49,8 +48,7 @@ TABLE: Table = {
             PLANT,
             MAP,
             RECORDINGS,
-            TIME,
-            COLUMNS,
+            *READING,
             argument(
                 "--initial",
                 metavar="NODE=VALUE,...",
@@ -74,8 +72,7 @@ TABLE: Table = {
             PLANT,
             MAP,
             RECORDINGS,
-            TIME,
-            COLUMNS,
+            *READING,
             argument("--out", metavar="PLANT2", help="write the refitted plant"),
             argument(
                 "--held-out", nargs="+", metavar="REC", help="recordings for validation; not used in the fit"

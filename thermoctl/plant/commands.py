@@ -22,7 +22,7 @@ from thermoctl.plant.recordings import as_recorded, read_recordings
 from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.files import write_table
-from thermoctl.recording.logger import parsed_columns
+from thermoctl.recording.logger import options, print_notes
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
@@ -143,10 +143,8 @@ def _courses(plant: Plant, title: str, y: np.ndarray) -> Grid:
 
 def _read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
     """Read recordings with the options --time and --columns; print their notes."""
-    tables = read_recordings(plant, paths, args.time, parsed_columns(args.columns))
-    for table in tables:
-        for note in table.notes:
-            print(f"note: {table.path}: {note}", file=sys.stderr)
+    tables = read_recordings(plant, paths, **options(args))
+    print_notes(tables)
     return tables
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,9 +10,9 @@ from thermoctl.plant.files import loads
 from thermoctl.plant.first import motion, tanks, template, thermal
 from thermoctl.plant.first.columns import COLDEST, HOTTEST, Column, quoted, recognise
 from thermoctl.plant.first.template import TEMPLATES
-from thermoctl.recording.dialect import split_unit
-from thermoctl.recording.logger import parsed_columns, read_recording
+from thermoctl.recording.logger import options, print_notes, read_recording
 from thermoctl.recording.table import Table
+from thermoctl.recording.units import split_unit
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError, suggest
 
@@ -51,10 +50,10 @@ def new(args: argparse.Namespace) -> int:
 
 
 def _from_recording(args: argparse.Namespace) -> str:
-    chosen = parsed_columns(args.columns)
-    table = read_recording(args.from_csv, args.time, {} if args.template else chosen)
-    for note in table.notes:
-        print(f"note: {table.path}: {note}", file=sys.stderr)
+    how = options(args)
+    chosen = how["columns"]
+    table = read_recording(args.from_csv, **how | ({"columns": {}} if args.template else {}))
+    print_notes([table])
     inputs, outputs = _named(table, args.inputs), _named(table, args.outputs)
     columns = recognise(table, {**(inputs or {}), **(outputs or {})})
     if not args.template:

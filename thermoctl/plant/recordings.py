@@ -7,14 +7,15 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.units import conversion
-from thermoctl.recording.dialect import split_unit
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
+from thermoctl.recording.units import split_unit
 from thermoctl.yamlfile import InputError
 
 
@@ -23,12 +24,14 @@ def read_recordings(
     paths: Iterable[str | Path],
     time: str | None = None,
     columns: Mapping[str, str] | None = None,
+    **how: Any,
 ) -> list[Table]:
     """Read the recordings of any logger for a plant, in its units. Raises InputError.
 
-    `time`: the column of times; `columns`: name that the plant reads: name in the file."""
+    `time`: the column of times; `columns`: name that the plant reads: name in the file; `how`: see
+    `logger.How`."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is Arrow's and numpy's
-        return list(pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns)), paths))
+        return list(pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns, **how)), paths))
 
 
 def in_plant_units(plant: Plant, table: Table) -> Table:

@@ -1,41 +1,82 @@
-"""Times as loggers write them, in seconds: dates, times of day, unix times, clocks with a unit."""
+"""Times as loggers write them, in seconds: dates, times of day, durations, counts from an epoch."""
 
 from __future__ import annotations
 
+import functools
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-NAMES = (
-    "t", "time", "timestamp", "datetime", "date_time", "date time", "zeit", "zeitstempel", "datum", "date", "elapsed",
-    "elapsed time", "time_s", "time_ms", "time_us", "temps", "tiempo", "uhrzeit", "unix", "unixtime", "epoch",
-)  # fmt: skip
-DATES, CLOCKS = ("date", "datum"), ("time", "zeit", "uhrzeit", "time of day")
-SECONDS = {
-    "s": 1.0,
-    "sec": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "µs": 1e-6,
-    "ns": 1e-9,
-    "min": 60.0,
-    "h": 3600.0,
-    "d": 86400.0,
-}
-# Unix times of the years 2001 to 2096, by the unit that they count.
-EPOCHS = (("s", 1e9, 4e9), ("ms", 1e12, 4e12), ("us", 1e15, 4e15), ("ns", 1e18, 4e18))
-_MONTHS = dict(jan=1, feb=2, mar=3, apr=4, may=5, jun=6, jul=7, aug=8, sep=9, oct=10, nov=11, dec=12)
-_DATE = r"(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|[A-Za-z]{3})[-/.](?P<c>\d{2,4})"
-_CLOCK = (
-    r"(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<p>[AaPp][Mm])?"
-    r"\s*(?P<z>Z|z|UTC|[+-]\d{2}:?\d{2})?"
-)
-_PATTERN = rf"^\s*(?:{_DATE}(?:[T ,]\s*|$))?(?:{_CLOCK})?\s*$"
-_TIME = re.compile(_PATTERN)
+from thermoctl.recording.units import SECONDS
+
 DAY_NS = 86_400_000_000_000
+DAY_S = 86_400.0
+_MONTHS = dict(jan=1, feb=2, mar=3, apr=4, may=5, jun=6, jul=7, aug=8, sep=9, oct=10, nov=11, dec=12)
+_MONTHS |= dict(
+    mär=3, mrz=3, mai=5, okt=10, dez=12, fév=2, fev=2, avr=4, jui=6, aoû=8, déc=12, ene=1, abr=4, ago=8
+)
+_MONTHS |= dict(dic=12, gen=1, mag=5, giu=6, lug=7, set=9, ott=10, maj=5, mrt=3, mei=5, juin=6, juil=7, aug=8)
+_ZONES = dict(z=0, utc=0, gmt=0, wet=0, west=1, bst=1, cet=1, cest=2, mez=1, mesz=2, eet=2, eest=3, msk=3)
+_ZONES |= dict(est=-5, edt=-4, cdt=-5, mst=-7, mdt=-6, pst=-8, pdt=-7, jst=9, kst=9, aest=10, aedt=11)
+_LETTER = r"[^\x00-\x40\x5B-\x60\x7B-\x7F]"  # of any alphabet; \pL takes Arrow milliseconds to compile
+_DATE = r"(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|{L}{3,4})[-/.](?P<c>\d{1,4})".replace("{L}", _LETTER)
+_CLOCK = (
+    r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<p>[AaPp][Mm])?"
+    r"\s*(?P<z>[+-]\d{2}:?\d{2}|[A-Za-z]{1,4})?"
+)
+_PATTERN = rf"^(?:{_DATE}(?:[T ,;]\s*|$))?(?:{_CLOCK})?$"
+# Other spellings, brought to the pattern's before it is tried: (expression, replacement).
+_SPELLINGS = tuple(
+    (pattern.replace("{L}", _LETTER), by)
+    for pattern, by in (
+        (r"^(?:(?i:mon|tue|wed|thu|fri|sat|sun|mo|di|mi|do|fr|sa|so){L}*\.?,?\s+)(\d|{L})", r"\1"),
+        (r"([ap])\.\s?m\.", r"\1m"),
+        (r"^({L}{3}){L}*\.?\s+(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2}\S*)\s+(\d{4})$", r"\2-\1-\4 \3"),
+        (r"^({L}{3}){L}*\.?\s+(\d{1,2}),?\s+(\d{4})", r"\2-\1-\3"),
+        (r"^(\d{1,2})\.?[ -]({L}{3}){L}*\.?,?[ -](\d{2,4})([ ,T]|$)", r"\1-\2-\3\4"),
+        (r"^(\d{4})年(\d{1,2})月(\d{1,2})日", r"\1-\2-\3"),
+        (r"^((?:19|20)\d{2})(\d{2})(\d{2})$", r"\1-\2-\3"),
+        (r"^((?:19|20)\d{2})(\d{2})(\d{2})[T _-]?(\d{2})(\d{2})$", r"\1-\2-\3 \4:\5"),
+        (
+            r"^((?:19|20)\d{2})(\d{2})(\d{2})[T _-]?(\d{2})(\d{2})(\d{2})[.,]?(\d*)(Z?)$",
+            r"\1-\2-\3 \4:\5:\6.\7\8",
+        ),
+        (r"^(\d{4}-\d{2}-\d{2})[_T -](\d{2})[-.](\d{2})[-.](\d{2})(?:[-.](\d+))?$", r"\1 \2:\3:\4.\5"),
+        (r"^(\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4})[-_:](\d{1,2}:\d{2})", r"\1 \2"),
+        (r"^(\d{4}:\d{2}:\d{2}) (\d)", r"\1T\2"),
+        (r"\.(Z?)$", r"\1"),
+        (r"^(\d{1,3}):(\d{2})([.,]\d+)$", r"0:\1:\2\3"),
+        (r"\s*\(?(?:GMT|UTC)([+-])(\d)(?::?(\d{2}))?\)?$", r"\g<1>0\2:\3"),
+        (r"\s*\(?(?:GMT|UTC)([+-])(\d{2}):?(\d{2})?\)?$", r"\1\2:\3"),
+        (r"([+-]\d{2}):?$", r"\1"),
+        (r"(:\d{2}(?:[.,]\d+)?\s?)([+-]\d{2})$", r"\g<1>\2:00"),
+    )
+)
+_DURATION = r"^(?P<sign>-)?(?P<d>\d+) ?d(?:ays?)?,? *(?P<rest>\d{1,2}:\d{2}.*)$"
+_MAYBE = re.compile(r"\d\D+\d|\d\D*[^\W\d_]{3}|[^\W\d_]{3}\W*\d")
+_ONE_SPELLINGS = tuple((re.compile(p), by) for p, by in _SPELLINGS)
+_ONE_TIME, _ONE_DURATION = re.compile(_PATTERN), re.compile(_DURATION)
+# A number's epoch: name, seconds of a count, its zero in seconds since 1970, least and largest count.
+_1904, _1601, _1899 = -2_082_844_800.0, -11_644_473_600.0, -2_209_161_600.0
+EPOCHS = (
+    ("unix s", 1.0, 0.0, 9e8, 3.2e9),
+    ("unix ms", 1e-3, 0.0, 9e11, 3.2e12),
+    ("unix us", 1e-6, 0.0, 9e14, 3.2e15),
+    ("unix ns", 1e-9, 0.0, 9e17, 3.2e18),
+    ("s since 1904", 1.0, _1904, 3.2e9, 4.2e9),
+    ("ms since 1904", 1e-3, _1904, 3.2e12, 4.2e12),
+    ("100 ns since 1601", 1e-7, _1601, 1.2e17, 1.7e17),
+    ("100 ns since the year 1", 1e-7, -62_135_596_800.0, 6.2e17, 6.8e17),
+    ("days since 1900 (Excel)", DAY_S, _1899, 36_526.0, 73_050.0),
+    ("days since the year 0 (MATLAB)", DAY_S, -719_529.0 * DAY_S, 730_486.0, 767_011.0),
+    ("millionths of a day since 1900 (WinCC)", DAY_S / 1e6, _1899, 3.6e10, 7.3e10),
+    ("Julian days", DAY_S, -2_440_587.5 * DAY_S, 2_451_544.0, 2_488_070.0),
+)
+YEARS = 20, 39  # two digits that are a year rather than a day
+LONG = 1e8  # counts of an epoch that hardly any signal has
 
 
 class ClockError(Exception):
@@ -48,66 +89,137 @@ class ClockError(Exception):
 
 @dataclass(frozen=True)
 class Seconds:
-    """`t` (N,) in seconds; `start`: the date of t = 0 where it is known; `note`: how the times were read."""
+    """`t` (N,) in seconds; `start`: the date of t = 0 where it is known; `note`: how the times were read.
+
+    `kind`: date and time, date, time of day, duration, epoch, unit, or bare (a number without a unit)."""
 
     t: np.ndarray
     start: str | None = None
     note: str = ""
+    kind: str = "bare"
 
 
+def tidied(texts: pa.Array) -> pa.Array:
+    """Return times in the one spelling that `from_texts` reads."""
+    texts = pc.utf8_trim(texts, characters=" \t\"'\u00a0")
+    for pattern, by in _SPELLINGS:
+        texts = pc.replace_substring_regex(texts, pattern, by.replace(r"\g<1>", r"\1"))
+    return texts
+
+
+@functools.lru_cache(65536)
 def is_time(cell: str) -> bool:
-    """Return whether a cell is a date, a time of day, or both."""
-    return bool(cell.strip() and _TIME.match(cell))
+    """Return whether a cell is a date, a time of day, both, or a duration of days and a time."""
+    text = cell.strip(" \t\"'\u00a0")
+    if not _MAYBE.search(text) or len(text) > 64:  # noqa: PLR2004
+        return False
+    for pattern, by in _ONE_SPELLINGS:
+        text = pattern.sub(by, text)
+    return bool(text and (_ONE_TIME.match(text) or _ONE_DURATION.match(text)))
 
 
-def from_numbers(values: np.ndarray, unit: str | None) -> Seconds:
-    """Return numbers as seconds: in the unit that the header states, or unix times by their size."""
+def are_times(texts: pa.Array) -> bool:
+    """Return whether all cells of a column are dates or times of day. A bare number is none."""
+    return bool(times(texts).all())
+
+
+def times(texts: pa.Array) -> np.ndarray:
+    """Return which cells (N,) are dates, times of day or durations; a bare number is none."""
+    tidy = tidied(texts)
+    right = pc.or_(
+        pc.and_(pc.match_substring_regex(tidy, _PATTERN), pc.match_substring_regex(texts, r"\D")),
+        pc.match_substring_regex(tidy, _DURATION),
+    )
+    return np.array(pc.and_(right, pc.not_equal(tidy, "")).to_numpy(zero_copy_only=False), dtype=bool)
+
+
+def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Seconds:
+    """Return numbers as seconds: by their epoch, else in the unit that the header states.
+
+    `dated`: the name is one of a date or a time, so that small counts (days of Excel) may be dates."""
+    finite = values[np.isfinite(values)]
+    for name, scale, zero, low, high in EPOCHS if len(finite) else ():
+        stated = unit is None or abs(SECONDS.get(unit, np.nan) - scale) < 1e-9 * scale
+        if stated and low <= finite.min() and finite.max() <= high and (dated or low > LONG):
+            start = _date(finite[0] * scale + zero)
+            where = " UTC" if name.startswith("unix") else ""
+            t = (values - finite[0]).astype(float) * scale
+            if scale >= DAY_S / 1e6:  # floats of days: to the microsecond that they can hold
+                t = np.round(t, 5)
+            note = f"time read as {name}, from {start.replace('T', ' ')}{where}"
+            return Seconds(t, start + ("Z" if where else ""), note, "epoch")
     if unit in SECONDS:
         scale = SECONDS[unit]
-        return Seconds(values * scale, note="" if scale == 1 else f"time converted from {unit} to s")
-    finite = values[np.isfinite(values)]
-    for name, low, high in EPOCHS:
-        if len(finite) and low <= finite.min() and finite.max() <= high:
-            begin = finite[0]
-            start = np.datetime64(int(begin * SECONDS[name] * 1e3), "ms")
-            return Seconds(
-                (values - begin) * SECONDS[name], f"{start}Z", f"time read as unix {name}, from {start} UTC"
-            )
-    return Seconds(values, note="" if unit is None else f"unit '{unit}' of the time is not known; read as s")
+        return Seconds(values * scale, None, "" if scale == 1 else f"time converted from {unit} to s", "unit")
+    return Seconds(
+        np.asarray(values, float), None, "" if unit is None else f"unit '{unit}' is no time; read as s"
+    )
 
 
-def from_texts(texts: pa.Array | pa.ChunkedArray) -> Seconds:
-    """Return dates or times of day as seconds from the first. Raises ClockError.
+def _date(seconds: float) -> str:
+    return str(np.datetime64(round(seconds * 1e3), "ms"))
+
+
+def from_stamps(stamps: np.ndarray) -> Seconds:
+    """Return datetime64 or timedelta64 values as seconds from the first."""
+    ns = stamps.astype("datetime64[ns]" if stamps.dtype.kind == "M" else "timedelta64[ns]")
+    whole = ns.astype(np.int64)
+    there = ~np.isnat(ns)
+    first = whole[there][0] if there.any() else 0
+    if stamps.dtype.kind == "m":
+        return Seconds(np.where(there, whole / 1e9, np.nan), None, "", "duration")
+    start = _date(first / 1e9)
+    t = np.where(there, (whole - first) / 1e9, np.nan)
+    return Seconds(t, start, f"dates from {start.replace('T', ' ')}", "date and time")
+
+
+def from_texts(texts: pa.Array) -> Seconds:
+    """Return dates, times of day or durations as seconds from the first. Raises ClockError.
 
     A time of day that runs backwards by more than half a day is past midnight."""
-    texts = texts.combine_chunks() if isinstance(texts, pa.ChunkedArray) else texts
     empty = pc.fill_null(pc.equal(pc.utf8_trim_whitespace(texts), ""), True)
     if pc.any(empty).as_py():
         raise ClockError(pc.index(empty, True).as_py(), "the time is missing; a date or time was expected")
     if (quick := _iso(texts)) is not None:
         return quick
-    parts = pc.extract_regex(texts, _PATTERN)
-    if parts.null_count:
-        row = int(np.argmax(parts.is_null().to_numpy(zero_copy_only=False)))
-        given = texts[row].as_py()
-        raise ClockError(
-            row, f"'{given[:40]}' is no date or time; one such as 2026-03-14T09:26:53.5 was expected"
-        )
-    field = {name: parts.field(i) for i, name in enumerate("abchmsfpz")}
+    tidy = tidied(texts)
+    if pc.all(pc.match_substring_regex(tidy, _DURATION)).as_py():
+        parts = pc.extract_regex(tidy, _DURATION)
+        t = _whole(parts.field("d")) * DAY_S + _clock_ns(_fields(parts.field("rest"))) / 1e9
+        return Seconds(t, None, "durations of days and a time", "duration")
+    field = _fields(tidy)
     clock = _clock_ns(field)
     dated = pc.not_equal(field["a"], "").to_numpy(zero_copy_only=False)
     if not dated.any():
+        if _whole(field["h"]).max() > 24:  # noqa: PLR2004
+            return Seconds(clock / 1e9, None, "durations read as hours, minutes and seconds", "duration")
         days = np.concatenate([[0], np.cumsum(np.diff(clock) < -DAY_NS // 2)])
         ns = clock + days * DAY_NS
         note = "time of day read as seconds from the first" + (
             f"; past midnight {days[-1]} times" if days[-1] else ""
         )
-        return Seconds((ns - ns[0]) / 1e9, None, note)
+        return Seconds((ns - ns[0]) / 1e9, None, note, "time of day")
     if not dated.all():
         raise ClockError(int(np.argmin(dated)), "a time without a date among dates")
     ns, order = _dated(field, clock)
-    start = str(np.datetime64(int(ns[0]) // 1_000_000, "ms"))
-    return _since(ns, start, order, bool(field["z"][0].as_py()))
+    timed = bool(pc.any(pc.not_equal(field["h"], "")).as_py())
+    zone = field["z"][0].as_py()
+    found = _since(ns, order, bool(zone) and (zone[0] in "+-" or zone.lower() in ("z", "utc", "gmt")), timed)
+    if zone and zone.lower() not in ("z", "utc", "gmt") and zone[0] not in "+-":
+        found = replace(found, note=f"{found.note} (zone {zone})")
+    return found
+
+
+def _fields(tidy: pa.Array) -> dict[str, pa.Array]:
+    parts = pc.extract_regex(tidy, _PATTERN)
+    empty = pc.or_(parts.is_null(), pc.equal(tidy, ""))
+    if pc.any(empty).as_py():
+        row = pc.index(empty, True).as_py()
+        given = tidy[row].as_py()
+        raise ClockError(
+            row, f"'{given[:40]}' is no date or time; one such as 2026-03-14T09:26:53.5 was expected"
+        )
+    return {name: parts.field(name) for name in "abchmsfpz"}
 
 
 def _iso(texts: pa.Array) -> Seconds | None:
@@ -119,72 +231,109 @@ def _iso(texts: pa.Array) -> Seconds | None:
             continue
         if ns.null_count:
             return None
-        start = str(np.datetime64(int(ns[0].as_py()) // 1_000_000, "ms"))
-        return _since(ns.to_numpy(), start, "year-month-day", zone is not None)
+        timed = bool(pc.any(pc.match_substring(texts, ":")).as_py())
+        return _since(ns.to_numpy(zero_copy_only=False), "year-month-day", zone is not None, timed)
     return None
 
 
-def _since(ns: np.ndarray, start: str, order: str, zoned: bool) -> Seconds:
+def _since(ns: np.ndarray, order: str, zoned: bool, timed: bool = True) -> Seconds:
+    start = str(np.datetime64(int(ns[0]) // 1_000_000, "ms"))
     note = f"dates read as {order}, from {start.replace('T', ' ')}{' UTC' if zoned else ''}"
-    return Seconds((ns - ns[0]) / 1e9, start + ("Z" if zoned else ""), note)
+    return Seconds(
+        (ns - ns[0]) / 1e9, start + ("Z" if zoned else ""), note, "date and time" if timed else "date"
+    )
 
 
 def _whole(column: pa.Array) -> np.ndarray:
-    return pc.if_else(pc.equal(column, ""), "0", column).cast(pa.int64()).to_numpy()
+    return pc.if_else(pc.equal(column, ""), "0", column).cast(pa.int64()).to_numpy(zero_copy_only=False)
 
 
 def _clock_ns(field: dict[str, pa.Array]) -> np.ndarray:
     hour, minute, second = (_whole(field[k]) for k in "hms")
-    wrong = (hour > 24) | (minute > 59) | (second > 60)
+    half = pc.utf8_lower(field["p"]).to_numpy(zero_copy_only=False)
+    dated = pc.not_equal(field["a"], "").to_numpy(zero_copy_only=False)
+    wrong = ((hour > 24) & (dated | (half != ""))) | (minute > 59) | (second > 60)  # noqa: PLR2004
     if wrong.any():
         raise ClockError(int(wrong.argmax()), "a time of day beyond 24:59:60")
-    half = pc.utf8_lower(field["p"]).to_numpy(zero_copy_only=False)
     if (half != "").any():
         hour = np.where(half == "", hour, hour % 12 + np.where(half == "pm", 12, 0))
     fraction = _whole(pc.utf8_rpad(field["f"], 9, "0"))
     zone = np.zeros(len(hour), np.int64)
-    for text in pc.unique(field["z"]).to_pylist():
+    names = pc.unique(field["z"]).to_pylist()
+    for text in names:
+        here = pc.equal(field["z"], text).to_numpy(zero_copy_only=False)
         if text and text[0] in "+-":
-            minutes = int(text[1:3]) * 60 + int(text[-2:])
-            here = pc.equal(field["z"], text).to_numpy(zero_copy_only=False)
-            zone[here] = minutes * (1 if text[0] == "+" else -1)
+            zone[here] = (int(text[1:3]) * 60 + int(text[-2:])) * (1 if text[0] == "+" else -1)
+        elif text and text.lower() in _ZONES:
+            zone[here] = 60 * _ZONES[text.lower()] if len(names) > 1 else 0
+        elif len(names) > 1:
+            raise ClockError(
+                int(np.argmax(here)), f"the zone '{text}' among others is not known; write the times in UTC"
+            )
     return ((hour * 60 + minute - zone) * 60 + second) * 1_000_000_000 + fraction
 
 
 def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, str]:
     """Nanoseconds since 1970, and the order of year, month and day that was found."""
-    middle = field["b"]
+    middle = pc.utf8_lower(field["b"])
     named = [t for t in pc.unique(middle).to_pylist() if t.isalpha()]
     for text in named:
-        if text.lower() not in _MONTHS:
-            row = pc.index(middle, text).as_py()
-            raise ClockError(row, f"'{text}' is no month; jan to dec were expected")
-        middle = pc.if_else(pc.equal(middle, text), str(_MONTHS[text.lower()]), middle)
+        month = _MONTHS.get(text, _MONTHS.get(text[:3]))
+        if month is None:
+            raise ClockError(
+                pc.index(middle, text).as_py(), f"'{text}' is no month; jan to dec were expected"
+            )
+        middle = pc.if_else(pc.equal(middle, text), str(month), middle)
     a, b, c = _whole(field["a"]), _whole(middle), _whole(field["c"])
-    if a.max() > 31 or len(field["a"][0].as_py()) == 4:
+    if a.max() > 31 or len(field["a"][0].as_py()) == 4:  # noqa: PLR2004
         orders = {"year-month-day": (a, b, c)}
     else:
-        year = np.where(c < 100, c + 2000, c)
+        year = np.where(c < 100, c + 2000, c)  # noqa: PLR2004
         orders = {"day.month.year": (year, b, a), "month/day/year": (year, a, b)}
+        if len(field["c"][0].as_py()) == 2:  # noqa: PLR2004
+            orders["year/month/day"] = (a + 2000, b, c)
         if named:
-            del orders["month/day/year"]
+            orders = {"day.month.year": (year, b, a)}
     found = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
-    if len(found) > 1:  # both orders are dates: keep one that runs forward
-        forward = {k: ns for k, ns in found.items() if (np.diff(ns) > 0).all()}
-        found = forward or found
     if not found:
         raise ClockError(0, "no date: a month of 1 to 12 and a day of 1 to 31 were expected")
-    first, *rest = found.items()
-    for _, other in rest:
-        if not np.array_equal(other - other[0], first[1] - first[1][0]):
+    if "year/month/day" in found and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
+        prefer = ["year/month/day", *orders]
+    else:
+        prefer = ["month/day/year", *orders] if pc.any(pc.not_equal(field["p"], "")).as_py() else list(orders)
+    return _one_order(found, prefer)
+
+
+def _one_order(found: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
+    """Return the order of day and month that runs forward, evenly; any if all give the same seconds."""
+    if len(found) > 1:
+        forward = {k: ns for k, ns in found.items() if (np.diff(ns) >= 0).all()}
+        found = forward or found
+    if len({(ns - ns[0]).tobytes() for ns in found.values()}) == 1 < len(found):
+        order = next(o for o in prefer if o in found)
+        return found[order], order + " (or another order: the seconds are the same)"
+    if len(found) > 1:  # steps of a second in one order are months in the other
+        even, uneven = {}, 0
+        for order, ns in found.items():
+            steps = np.diff(ns)
+            if len(steps) > 1 and steps.max() <= 3 * np.sort(steps)[(len(steps) - 1) // 2]:
+                even[order] = ns
+            uneven += len(steps) > 1 and steps.max() > 20 * max(steps.min(), 1)
+        if len(even) != 1 or uneven != len(found) - 1:
             raise ClockError(0, "day and month cannot be told apart; write the dates as 2026-03-14")
-    return first[1], first[0]
+        found = even
+    ((order, ns),) = found.items()
+    return ns, order
 
 
 def _valid(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> bool:
-    return bool(
+    if not (
         month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31 and year.min() >= 1
-    )
+    ):  # noqa: PLR2004
+        return False
+    months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
+    length = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)
+    return bool(np.all(day <= length))
 
 
 def _days(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> np.ndarray:

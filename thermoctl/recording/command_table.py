@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import COLUMNS, JSON, LOOK, TIME, Table, argument, command
+from thermoctl.command import JSON, LOOK, READING, Table, argument, command
 
 TABLE: Table = {
     LOOK: (
@@ -41,13 +41,14 @@ TABLE: Table = {
             "thermoctl.recording.commands:import_recordings",
             "",
             argument(
-                "files", nargs="+", metavar="FILE", help="CSV of any dialect, .xlsx, .mf4, .tdms, .parquet"
+                "files",
+                nargs="+",
+                metavar="FILE",
+                help="text of any dialect, .xlsx, .mf4, .tdms, .mat, .json, .parquet",
             ),
-            argument(
-                "--out", required=True, metavar="OUT", help="OUT.parquet (or .csv, .arrow: without units)"
-            ),
-            TIME,
-            COLUMNS,
+            argument("--out", metavar="OUT", help="OUT.parquet (or .csv, .arrow: without units)"),
+            argument("--explain", action="store_true", help="say how each file is read, and why"),
+            *READING,
         ),
         command(
             "recordings recover",

@@ -6,13 +6,12 @@ import argparse
 import dataclasses
 import json
 import math
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from thermoctl.recording.files import write_table
-from thermoctl.recording.logger import joined, parsed_columns, read_recording
+from thermoctl.recording.logger import joined, options, print_notes, read_recording
 from thermoctl.recording.reader import export, info, recover
 from thermoctl.recording.writer import FULL, TIER, recording_files
 from thermoctl.yamlfile import InputError
@@ -101,15 +100,25 @@ def export_recording(args: argparse.Namespace) -> int:
 
 
 def import_recordings(args: argparse.Namespace) -> int:
-    """Write the recording of any logger as Parquet, with units; several files are parts of one recording."""
-    parts = [read_recording(p, args.time, parsed_columns(args.columns)) for p in args.files]
-    for part in parts:
-        for note in part.notes:
-            print(f"note: {part.path}: {note}", file=sys.stderr)
-    table = joined(parts)
-    write_table(args.out, table)
-    units = ", ".join(f"{n} [{table.units[n]}]" if n in table.units else n for n in table.columns)
-    print(f"{args.out}: {len(table)} rows, {table.t[-1] - table.t[0]:.6g} s; {units}")
+    """Write the recording of any logger as Parquet, with units; several files are parts of one recording.
+
+    With --explain say how each file is read, and why. Raises InputError without --out and --explain."""
+    if not (args.out or args.explain):
+        raise InputError("recordings import: --out OUT.parquet was expected, or --explain")
+    how = options(args)
+    parts = []
+    for path in args.files:
+        trace: list[str] = []
+        parts.append(read_recording(path, **how, trace=trace))
+        for line in trace if args.explain else ():
+            print(f"{path}: {line}")
+    if not args.explain:
+        print_notes(parts)
+    if args.out:
+        table = joined(parts)
+        write_table(args.out, table)
+        units = ", ".join(f"{n} [{table.units[n]}]" if n in table.units else n for n in table.columns)
+        print(f"{args.out}: {len(table)} rows, {table.t[-1] - table.t[0]:.6g} s; {units}")
     return 0
 
 

@@ -1,6 +1,7 @@
 """The dialect of a text file that a logger wrote: encoding, separator, decimal sign, header, units.
 
-It is found from the file's first lines. A line is data if at least half of its cells are numbers or times.
+It is found from the file's first lines. A line is data if most of its cells are of the kind (number, time)
+that the column holds in the later lines.
 """
 
 from __future__ import annotations
@@ -10,52 +11,51 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from thermoctl.recording.axis import is_generic, named
+from thermoctl.recording.cells import is_missing, is_number
 from thermoctl.recording.clock import is_time
+from thermoctl.recording.units import SECONDS, WORDS, known, spelled, split_unit, split_words
 from thermoctl.yamlfile import InputError
 
-MISSING = ("", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", "-", "--", "---", "#N/A")
 SAMPLE = 400  # lines that decide
-FEW = 20  # lines; of more, a head takes at most half
-SEPARATORS = (",", ";", "\t", "|")
-_POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
-_COMMA = re.compile(r"[-+]?(\d+,?\d*|,\d+)([eE][-+]?\d+)?$")
-# Symbols that make `(...)` behind a name a unit; square brackets always hold one.
-_SYMBOL = (
-    r"(?:°[CF]|℃|℉|deg ?[CF]?|Celsius|Fahrenheit|Kelvin|%|°|rad|min|h|hr|ppm|bar|psi|rpm|"
-    r"(?:da|[fpnuµμmcdkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|Ohm|ohm|F|H|C|T|Wh|l|L|mol|bar))"
+FEW = 5  # lines; of more, a head takes at most half
+SEPARATORS = (",", ";", "\t", "|", "  ", " ")
+HEAD_LINES = 6  # above the data, of which names, units and the kind of value are taken
+UNIT_LENGTH = 16  # characters of a cell in a line of units
+_COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|NUM|REF|BEZUG|NULL)!))")
+_COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
+_AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
+_KINDS = {"", *WORDS["kinds"].split()}
+_STEP = re.compile(
+    r"(?i)^(?:.*(?:sampl\w*|scan|log\w*|record\w*|acqui\w*|mess|abtast)\w*[\s_-]*(?:interval|period|time|rate|freq\w*|clock|step|intervall|zeit|rate)?"
+    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency)\b.*$"
 )
-_POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
-_UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
-_NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
-_SPELLED = {
-    "Celsius": "degC",
-    "Fahrenheit": "degF",
-    "Kelvin": "K",
-    "°": "deg",
-    "hr": "h",
-    "Ohm": "ohm",
-    "Ω": "ohm",
-}
+_RATE = re.compile(r"(?i)rate|freq|hz")
+_VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
 
 
 @dataclass(frozen=True)
 class Dialect:
     """How a text file is to be read.
 
-    `names` and `units` by column; `first`: its first line of data, from 1; `texts`: columns without numbers;
-    `notes`: the guesses."""
+    - `names`, `units`: by column
+    - `first`: its first line of data, from 1
+    - `numeric`: columns of plain numbers, as far as the sample shows
+    - `facts`: statements of the lines above the header, by their keys
+    - `notes`: the guesses"""
 
     separator: str
-    decimal: str
+    decimal: str | None
     names: tuple[str, ...]
     units: dict[str, str]
     first: int
-    texts: frozenset[str]
-    times: frozenset[str]
+    numeric: frozenset[str]
     notes: tuple[str, ...]
+    facts: dict[str, list[str]] = field(default_factory=dict)
+    header: tuple[str, ...] = ()
 
 
 def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
@@ -82,100 +82,95 @@ def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     return text.encode("utf-8"), (f"read as {name}",)
 
 
-def split_unit(header: str) -> tuple[str, str | None]:
-    """Return name and unit of `T_block [degC]`, `T_block (degC)`, `T_block / °C`; None for no unit."""
-    text = header.strip()
-    match = _NAMED.match(text)
-    if not match:
-        return text, None
-    name, square, bracket, slash = match.groups()
-    unit = (square if square is not None else bracket if bracket is not None else slash).strip()
-    if square is None and not _UNIT.match(unit):
-        return text, None
-    return name.strip(), spelled(unit)
-
-
-def spelled(unit: str) -> str | None:
-    """Return a unit as pint writes it: °C is degC; None where nothing is stated."""
-    unit = unit.strip().replace("μ", "µ").replace("℃", "degC").replace("℉", "degF")
-    unit = unit.replace("°C", "degC").replace("°F", "degF").replace("deg C", "degC").replace("deg F", "degF")
-    return _SPELLED.get(unit, unit) if unit not in ("", "-", "–") else None
-
-
 def lines(text: str) -> Iterator[tuple[int, str]]:
     """(line counted from 1, text) without comments and empty lines."""
     for number, line in enumerate(io.StringIO(text), 1):
-        if line.strip() and not line.lstrip(" \t").startswith("#"):
+        if line.strip() and not is_comment(line):
             yield number, line.rstrip("\r\n")
+
+
+def is_comment(line: str) -> bool:
+    """Return whether a line is a comment: # first, but no column's name `#` (HOBO), no `#N/A` of Excel."""
+    return bool(_COMMENT.match(line))
 
 
 def cells_of(line: str, separator: str) -> list[str]:
     """Return the cells of one line, unquoted and stripped."""
+    if separator in ("  ", " "):
+        if '"' in line:
+            return [
+                c.strip() for c in next(csv.reader([line.strip()], delimiter=" ", skipinitialspace=True), [])
+            ]
+        return re.split(r"\s{2,}|\t" if separator == "  " else r"\s+", line.strip())
     return [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
 
 
-def is_number(cell: str, decimal: str) -> bool:
-    """Return whether a cell is a number with this decimal sign."""
-    return bool((_POINT if decimal == "." else _COMMA).match(cell))
-
-
-def _sample(path: Path, text: str) -> tuple[list[tuple[int, str]], str | None]:
-    """Return the lines that decide, and the separator that a line `sep=;` states."""
+def _sample(path: Path, text: str) -> tuple[list[tuple[int, str]], list[tuple[int, str]], str | None]:
+    """Return the lines that decide, the comments above them, and the separator that a line `sep=;` states."""
     sample: list[tuple[int, str]] = []
+    comments: list[tuple[int, str]] = []
     stated = None
-    for number, line in lines(text):
-        if not sample and (match := re.match(r"sep=(.)\s*$", line)):
+    for number, line in enumerate(io.StringIO(text), 1):
+        if not line.strip():
+            continue
+        if is_comment(line):
+            comments.append((number, line.strip().lstrip("#% \t")))
+            continue
+        if not sample and (match := re.match(r"\"?sep=(.)\"?\s*$", line)):
             stated = match[1]
             continue
-        sample.append((number, line))
+        sample.append((number, line.rstrip("\r\n")))
         if len(sample) == SAMPLE:
             break
     if not sample:
         raise InputError(f"{path}: the file is empty; a header line with the column names was expected")
-    if len(sample) == 1:
+    if len(sample) == 1 and not comments:
         raise InputError(
             f"{path}:{sample[0][0]}: no rows; a header line and at least one sample below it were expected"
         )
-    return sample, stated
+    return sample, [c for c in comments if c[0] < sample[-1][0]], stated
+
+
+def _kind(cell: str) -> str:
+    if is_missing(cell):
+        return "-"
+    return "n" if is_number(cell) else "t" if is_time(cell) else "w"
 
 
 def find_dialect(path: Path, text: str) -> Dialect:
     """Find the dialect from the first lines of a file. Raises InputError (file:line) where there is none."""
-    notes: list[str] = []
-    sample, stated = _sample(path, text)
-    separator, decimal, rows = _separator(path, sample, (stated,) if stated else SEPARATORS)
+    sample, comments, stated = _sample(path, text)
+    separator, rows = _separator(path, sample, (stated,) if stated else SEPARATORS)
     width = Counter(len(c) for _, c in _tail(rows)).most_common(1)[0][0]
-    table = [(n, c) for n, c in rows if len(c) == width]
-    data = [_is_data(c, decimal) for _, c in table]
-    twice = [a and b for a, b in zip(data, [*data[1:], True], strict=True)]
-    begin = twice.index(True) if True in twice else len(table)
-    if begin == 0:
-        raise InputError(
-            f"{path}:{table[0][0]}: a header line with the column names was expected, found numbers; add one"
-        )
-    head = table[max(begin - 2, 0) : begin]
-    if len(head) == 2 and not _is_units(head[1][1]):  # another line of the same width above the header
-        head = head[1:]
-    names, units = _names(path, head[0], width)
-    if len(head) == 2:
-        stated_units = (spelled(c.strip("[]()")) for c in head[1][1])
-        units |= {n: u for n, u in zip(names, stated_units, strict=True) if u}
-        notes.append(f"line {head[1][0]} read as units")
-    if skipped := sum(1 for n, _ in rows if n < head[0][0]):
-        notes.append(f"{skipped} lines before the header left out")
+    begin = _begin(rows, width)
+    head = [(n, c) for n, c in rows[:begin]]
+    facts = _facts(
+        [
+            *comments,
+            *[(n, line) for n, line in sample if n < (rows[begin][0] if begin < len(rows) else 1 << 60)],
+        ],
+        separator,
+    )
+    data = [c for _, c in rows[begin:] if len(c) == width]
+    first = rows[begin][0] if begin < len(rows) else rows[-1][0] + 1
+    notes: list[str] = []
+    names, units, header, used = _header(path, head, comments, separator, width, data, facts, notes)
+    if skipped := sum(1 for n, _ in head if n not in used):
+        notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
+    decimal = _decimal(data, separator)
     if separator != ",":
-        shown = {"\t": "tab"}.get(separator, f"'{separator}'")
+        shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
         notes.append(f"separator {shown}" + (", decimal comma" if decimal == "," else ""))
-    texts, times = _kinds(names, [c for _, c in table[begin:]], decimal)
-    first = table[begin][0] if begin < len(table) else rows[-1][0] + 1
-    return Dialect(separator, decimal, names, units, first, texts, times, tuple(notes))
+    return Dialect(
+        separator, decimal, names, units, first, _numeric(names, data), tuple(notes), facts, header
+    )
 
 
 def _separator(
     path: Path, sample: list[tuple[int, str]], candidates: tuple[str, ...]
-) -> tuple[str, str, list[tuple[int, list[str]]]]:
-    """Return the separator and decimal sign that give lines of one width and most numbers."""
-    best: tuple[float, str, str, list[tuple[int, list[str]]]] | None = None
+) -> tuple[str, list[tuple[int, list[str]]]]:
+    """Return the separator that gives lines of one width and most numbers."""
+    best: tuple[float, str, list[tuple[int, list[str]]]] | None = None
     for separator in candidates:
         try:
             rows = [(n, cells_of(line, separator)) for n, line in sample]
@@ -183,62 +178,273 @@ def _separator(
             continue
         tail = [c for _, c in _tail(rows)]
         width, lines_of = Counter(len(c) for c in tail).most_common(1)[0]
-        if width < 2:
+        if width < 2:  # noqa: PLR2004
             continue
         cells = [x for c in tail if len(c) == width for x in c]
-        for decimal in ".," if separator != "," else ".":
-            good = sum(is_number(x, decimal) or x in MISSING or is_time(x) for x in cells)
-            score = lines_of / len(tail) * good / len(cells)
-            if best is None or score > best[0] + 1e-9:
-                best = score, separator, decimal, rows
-    if best is None or best[0] < 0.3:
+        good = sum(_kind(x) != "w" for x in cells)
+        score = lines_of / len(tail) * good / len(cells) - (0.01 if separator in ("  ", " ") else 0)
+        if separator == ";" and re.search(r"\d,\d", sample[-1][1]):
+            score += 0.005  # a decimal comma rather than two columns
+        if best is None or score > best[0] + 1e-9:
+            best = score, separator, rows
+    if best is None or best[0] < 0.3:  # noqa: PLR2004
         shown = sample[0][1][:60]
         raise InputError(
             f"{path}:{sample[0][0]}: '{shown}': no columns; a header line and rows separated by comma, "
-            "semicolon, tab or | were expected"
+            "semicolon, tab, | or blanks were expected"
         )
     return best[1:]
 
 
 def _tail(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    """Return the rows that are data most likely: the later half of many, all but the first of a few."""
-    return rows[max(1, len(rows) // 2) if len(rows) > FEW else 1 :]
+    """Return the rows that are data most likely: the later half, of a few all but the first."""
+    return rows[len(rows) // 2 if len(rows) > FEW else 1 :] or rows
 
 
-def _is_data(cells: list[str], decimal: str) -> bool:
-    filled = [c for c in cells if c not in MISSING]
-    return 2 * sum(is_number(c, decimal) or is_time(c) for c in filled) >= len(filled) > 0
+def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
+    """Return the index of the first row of data: it and the next have the kinds of the later rows."""
+    tail = [c for _, c in _tail(rows) if len(c) == width]
+    kinds = []
+    for i in range(width):
+        seen = Counter(k for c in tail if (k := _kind(c[i])) != "-")
+        kinds.append(seen.most_common(1)[0][0] if seen else "-")
+    expected = [i for i, k in enumerate(kinds) if k in "nt"]
+
+    def is_data(cells: list[str]) -> bool:
+        """Return whether half of the cells that should be numbers or times are."""
+        if len(cells) != width:
+            return False
+        if not expected:
+            return all(_kind(c) == "-" for c in cells[1:]) and any(c for c in cells)
+        there = [i for i in expected if not is_missing(cells[i])]
+        right = sum(_kind(cells[i]) in "nt" for i in there)
+        if expected[0] == 0 and there and there[0] == 0 and _kind(cells[0]) not in "nt":
+            return False  # a word where rows begin with their time: `Delta_X 0.1 0.1`
+        return 2 * right >= len(there) > 0 and 2 * right >= max(1, len(there))
+
+    data = [is_data(c) for _, c in rows]
+    # Without a word in the first column a row of a header can look like data; then the next row has to, too.
+    enough = 1 if expected[:1] == [0] else 2
+    for i, good in enumerate(data):
+        following = [d for (_, c), d in zip(rows[i + 1 :], data[i + 1 :], strict=True) if len(c) == width][
+            :FEW
+        ]
+        if good and (
+            not following or (2 * sum(following) >= len(following) and (enough == 1 or following[0]))
+        ):
+            return i
+    return len(rows)
 
 
-def _is_units(cells: list[str]) -> bool:
-    """Return whether a line below the header states units: all cells short, at least one a known unit."""
-    bare = [c.strip("[]()") for c in cells]
-    return all(len(c) <= 12 for c in bare) and any(_UNIT.match(c) for c in bare if c)
+def _is_units(cells: list[str], above: list[str]) -> bool:
+    """Return whether most cells of a line are units, and the line above it can be the header."""
+    bare = [c.strip("[]() ") for c in cells]
+    words = [c for c in bare if c and not is_number(c) and c.lower() not in ("ts", "rn") and named(c) == 0]
+    right = sum(known(c) for c in bare)
+    names = sum(bool(c) and (not is_number(c) or re.fullmatch(r"\d{1,3}", c) is not None) for c in above)
+    return (
+        all(len(c) <= UNIT_LENGTH for c in bare)
+        and right > 0
+        and 2 * right >= len(words)
+        and 2 * names >= len(above) > 1
+    )
 
 
-def _names(path: Path, head: tuple[int, list[str]], width: int) -> tuple[tuple[str, ...], dict[str, str]]:
-    line, cells = head
-    split = [split_unit(c) for c in cells]
+def _header(
+    path: Path,
+    head: list[tuple[int, list[str]]],
+    comments: list[tuple[int, str]],
+    separator: str,
+    width: int,
+    data: list[list[str]],
+    facts: dict[str, list[str]],
+    notes: list[str],
+) -> tuple[tuple[str, ...], dict[str, str], tuple[str, ...], set[int]]:
+    """Return names, units, the header's cells, and the lines that they were taken from."""
+    if paired := _paired(head, width, data):
+        return paired
+    lines_of = [(n, c) for n, c in head if _fits(c, width, data)][-HEAD_LINES:]
+    if not lines_of or (lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1):
+        found = _commented(comments, separator, width, head)
+        lines_of = [found] if found else lines_of
+    if not lines_of:
+        notes.append("no header: the columns are called column_1, column_2 ...")
+        return tuple(f"column_{i + 1}" for i in range(width)), {}, (), set()
+    below: list[tuple[int, list[str]]] = []
+    while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
+        below.append(lines_of.pop())
+    while len(lines_of) > 1 and below and sum(bool(c) for c in lines_of[-1][1]) < width / 2:
+        lines_of.pop()
+    line, cells = lines_of[-1]
+    cells = _widened(cells, width, data)
+    split = [split_words(c) for c in cells]
     names = [n for n, _ in split]
     # Two columns that differ by their units only keep them in their names.
     names = [c if names.count(n) > 1 else n for c, n in zip(cells, names, strict=True)]
+    names = _distinct(path, line, names, data)
+    units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}
+    for number, row in below:
+        if not _is_kinds(row):
+            stated = (
+                spelled(c.strip("[]()"), n) for c, n in zip(_widened(row, width, data), names, strict=True)
+            )
+            units |= {n: u for n, u in zip(names, stated, strict=True) if u and known(u)}
+            notes.append(f"line {number} read as units")
+            _below(lines_of[-1][1], row, facts)
+    units |= _aligned(facts, names, units)
+    return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
+
+
+def _paired(
+    head: list[tuple[int, list[str]]], width: int, data: list[list[str]]
+) -> tuple[tuple[str, ...], dict[str, str], tuple[str, ...], set[int]] | None:
+    """Return the header of pairs of a time and a value (Beckhoff Scope): `Name CH1 Name CH2`."""
+    pairs = {
+        c[0].lower(): (n, c) for n, c in head if len(c) == width and width % 2 == 0 and len(set(c[::2])) == 1
+    }
+    if "name" not in pairs or len(data) < 2:  # noqa: PLR2004
+        return None
+    names, units = [], {}
+    for i, name in enumerate(pairs["name"][1][1::2]):
+        names += [f"Time\0{2 * i}" if i else "Time", name]
+        if "unit" in pairs and (unit := spelled(pairs["unit"][1][2 * i + 1], name)):
+            units[name] = unit
+        unit = next((split_unit(k)[1] for k in pairs if k.startswith("sampletime")), None)
+        units[names[-2]] = unit or "ms"
+    if len(set(names)) < len(names):
+        return None
+    return tuple(names), units, tuple(pairs["name"][1]), {n for n, _ in pairs.values()}
+
+
+def _fits(cells: list[str], width: int, data: list[list[str]]) -> bool:
+    """Return whether a line above the data can be its header: as wide, but for an index or an empty end."""
+    filled = len(cells)
+    while filled and not cells[filled - 1]:
+        filled -= 1
+    if filled < 2 and width > 2:  # noqa: PLR2004
+        return False
+    more = {c.lower() for c in cells[width:]}
+    known_more = len(cells) > width and (
+        more <= {"start", "increment", ""} or all(is_number(c) or not c for c in more)
+    )
+    return len(cells) in (width, width - 1) or filled == width or known_more
+
+
+def _widened(cells: list[str], width: int, data: list[list[str]]) -> list[str]:
+    """Return as many names as columns: an index, or a date and a time under one name, leave one out."""
+    cells = cells[:width]
+    if len(cells) == width - 1:
+        kinds = [_kind(c) for c in data[0]] if data else []
+        empty = bool(data) and all(not row[-1] for row in data)
+        if not empty and kinds[:2] == ["t", "t"]:
+            return [cells[0], f"{cells[0]} of day", *cells[1:]]
+        return [*cells, ""] if empty else ["", *cells]
+    return cells + [""] * (width - len(cells))
+
+
+def _distinct(path: Path, line: int, names: list[str], data: list[list[str]]) -> list[str]:
+    """Return names that differ: an index without a name is one blank; a clock may stand twice."""
+    found: list[str] = []
     for i, name in enumerate(names):
-        if not name and i < width - 1:
-            raise InputError(f"{path}:{line}: column {i + 1} of {width} has no name in the header")
-        if name in names[:i]:
+        if not name:
+            found.append(" " if i == 0 else f"\0{i}")
+        elif name in found and named(name) <= 0 and not is_generic(name) and any(row[i] for row in data):
             raise InputError(f"{path}:{line}: the column '{name}' stands twice in the header; rename one")
-    units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n}
-    return tuple(names), units
+        elif name in found:
+            found.append(f"{name}\0{i}")
+        else:
+            found.append(name)
+    return found
 
 
-def _kinds(
-    names: tuple[str, ...], rows: list[list[str]], decimal: str
-) -> tuple[frozenset[str], frozenset[str]]:
-    """Columns of text and columns of times: by the sample's cells, none of which is a number."""
-    texts: set[str] = set()
-    times: set[str] = set()
-    for i, name in enumerate(names):
-        filled = [r[i] for r in rows if r[i] not in MISSING]
-        if filled and not any(is_number(c, decimal) for c in filled):
-            (times if all(is_time(c) for c in filled) else texts).add(name)
-    return frozenset(texts), frozenset(times)
+def _is_kinds(cells: list[str]) -> bool:
+    return all(c.lower() in _KINDS for c in cells) and len({c.lower() for c in cells}) <= len(_KINDS)
+
+
+def _commented(
+    comments: list[tuple[int, str]], separator: str, width: int, head: list[tuple[int, list[str]]]
+) -> tuple[int, list[str]] | None:
+    """Return the last comment as wide as the data: the header of numpy, gnuplot and others."""
+    for number, text in reversed(comments):
+        for sep in (separator, ",", ";", "\t", "  ", " "):
+            cells = cells_of(text, sep)
+            if len(cells) == width and not any(_kind(c) in "t" for c in cells):
+                return number, cells
+    return None
+
+
+def _facts(above: list[tuple[int, str]], separator: str) -> dict[str, list[str]]:
+    """Return the statements of the lines above the header: `Delta_X <tab> 0.1`, `Interval: 0.5 s`."""
+    found: dict[str, list[str]] = {}
+    for _, line in above:
+        cells = [
+            c.strip().strip('"')
+            for c in line.split(separator if separator.strip() or separator == "\t" else "\t")
+        ]
+        if len(cells) < 2 and (match := re.match(r"([^:=]{2,40})[:=]\s*(.+)$", line)):  # noqa: PLR2004
+            cells = [match[1].strip(), match[2].strip()]
+        elif len(cells) > 1 and cells[0].endswith((":", "=")):
+            cells[0] = cells[0][:-1].strip()
+        if len(cells) > 1 and cells[0]:
+            found.setdefault(cells[0].lower(), cells[1:])
+    return found
+
+
+def _below(cells: list[str], row: list[str], facts: dict[str, list[str]]) -> None:
+    """Take Start and Increment of an oscilloscope from the line below the header (Rigol)."""
+    for name, value in zip(cells, row, strict=False):
+        if name.lower() in ("start", "increment"):
+            facts[name.lower()] = [value]
+
+
+def _aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str]) -> dict[str, str]:
+    """Return units of a line above the header that names them by column (LVM: Y_Unit_Label)."""
+    for key, values in facts.items():
+        if re.search(r"(?i)^(y_?)?(unit|einheit|vunit)", key) and any(known(v) for v in values):
+            return {
+                n: str(spelled(v, n))
+                for n, v in zip(names[1:], values, strict=False)
+                if known(v) and n not in units
+            }
+    return {}
+
+
+def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
+    """Return the interval between rows that a file states above its header, and the first time, s."""
+    start = 0.0
+    for key in ("start", "x0", "xoffset", "hoffset", "trigger offset"):
+        if key in facts and (match := _VALUE.match(facts[key][0])):
+            start = float(match[1].replace(",", "."))
+    for key, values in facts.items():
+        if not _STEP.match(key):
+            continue
+        filled = [v for v in values if v]
+        match = _VALUE.match(filled[0]) if filled else None
+        if match is None:
+            continue
+        size = float(match[1].replace(",", "."))
+        stated = match[2] or (filled[1] if len(filled) > 1 else "") or (split_unit(key)[1] or "")
+        unit = spelled(stated) or ("Hz" if _RATE.search(key) else "s")
+        if unit in SECONDS and size > 0 and "rate" not in key:
+            return size * SECONDS[unit], start
+        if unit in ("Hz", "kHz", "MHz", "Sa/s", "S/s", "1/s") and size > 0:
+            return 1 / (size * {"kHz": 1e3, "MHz": 1e6}.get(unit, 1.0)), start
+    return None
+
+
+def _decimal(data: list[list[str]], separator: str) -> str | None:
+    """Return the decimal sign that the sample shows; None where a comma may part thousands."""
+    cells = [x for c in data for x in c if re.search(r"\d", x)]
+    commas = [x for x in cells if _COMMA.match(x)]
+    if not commas:
+        return None if any("," in x and not is_time(x) for x in cells) else "."
+    if any(re.match(r"[-+]?\d*\.\d", x) for x in cells):
+        return None
+    return "," if separator == ";" or any(not _AMBIGUOUS.match(x) for x in commas) else None
+
+
+def _numeric(names: tuple[str, ...], data: list[list[str]]) -> frozenset[str]:
+    """Return the columns of plain numbers in the sample; 15 digits and more are texts."""
+    plain = re.compile(r"(?!\d{15,}$)-?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$")
+    filled = {n: [r[i] for r in data if not is_missing(r[i])] for i, n in enumerate(names)}
+    return frozenset(n for n, seen in filled.items() if seen and all(plain.match(c) for c in seen))

@@ -18,7 +18,6 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from thermoctl.recording import formats
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import whole_file
@@ -91,8 +90,10 @@ def write_table(path: str | Path, table: Table) -> None:
 
 
 def to_arrow(table: Table) -> pa.Table:
-    """Return the table as Arrow: `t` first, float64, null for a missing sample; `meta`, units."""
-    arrays = {"t": table.t, **table.columns}
+    """Return the table as Arrow: `t` first, float64, null for a missing sample; `meta`, units.
+
+    A signal that its logger calls t becomes t_signal."""
+    arrays = {"t": table.t} | {"t_signal" if n == "t" else n: v for n, v in table.columns.items()}
     arrow = pa.table(
         {k: pa.array(np.asarray(v, dtype=np.float64), from_pandas=True) for k, v in arrays.items()}
     )
@@ -322,28 +323,11 @@ def _read_arrow(path: Path, want: list[str] | None) -> Raw:
     return _from_arrow(path, pa.Table.from_batches(batches, schema), want)
 
 
-def _read_mdf(path: Path, want: list[str] | None) -> Raw:
-    return _foreign(path, formats.read_mdf(path), want)
-
-
-def _read_tdms(path: Path, want: list[str] | None) -> Raw:
-    return _foreign(path, formats.read_tdms(path), want)
-
-
-def _foreign(path: Path, columns: dict[str, np.ndarray], want: list[str] | None) -> Raw:
-    return Raw(
-        {n: columns[n] for n in _picked(path, list(columns), want)}, {}, lambda row: f"{path}: row {row + 1}"
-    )
-
-
 READERS: dict[str, Callable[[Path, list[str] | None], Raw]] = {
     ".csv": _read_csv,
     ".parquet": _read_parquet,
     ".arrow": _read_arrow,
     ".arrows": _read_arrow,
     ".feather": _read_arrow,
-    ".mf4": _read_mdf,
-    ".mdf": _read_mdf,
-    ".tdms": _read_tdms,
 }
 FORMATS = ", ".join(READERS)

@@ -1,7 +1,7 @@
-"""Recordings of other programs: MDF4, TDMS and Excel read, MDF4 and MCAP written.
+"""Recordings of other programs: MDF, TDMS, Excel and MATLAB read, MDF4 and MCAP written.
 
-The libraries (asammdf, npTDMS, openpyxl, mcap) are an extra, `pip install 'thermoctl[formats]'`. Channels
-with different rates are merged by time, so most cells of a slow channel are empty.
+The libraries (asammdf, npTDMS, openpyxl, mat-io, mcap) are an extra, `pip install 'thermoctl[formats]'`. A
+reader returns sheets: columns that share a clock.
 """
 
 from __future__ import annotations
@@ -9,15 +9,23 @@ from __future__ import annotations
 import csv
 import io
 import json
-from datetime import UTC, date, datetime, time
+import warnings
+from collections.abc import Callable
+from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from thermoctl.extras import load
+from thermoctl.recording.clock import Seconds
+from thermoctl.recording.sheet import Cells, Sheet
 from thermoctl.recording.table import Table
+from thermoctl.recording.units import spelled
 from thermoctl.rig.signals import units
-from thermoctl.yamlfile import InputError
+from thermoctl.yamlfile import InputError, suggest
 
 
 def _damaged(path: Path, kind: str, e: Exception) -> InputError:
@@ -26,105 +34,302 @@ def _damaged(path: Path, kind: str, e: Exception) -> InputError:
     )
 
 
-def _united(path: Path, channels: list[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Merge channels (name, times (n,), values (n,)) into columns over the union of all times."""
-    if not channels:
-        raise InputError(f"{path}: no channels with a time; at least one was expected")
-    for name, t, values in channels:
-        if values.dtype.kind not in "fiub" or values.ndim != 1:
-            raise InputError(
-                f"{path}: row 1: channel '{name}': {str(values[:1].tolist())[:40]} stands where a "
-                "number belongs"
+def _timed(
+    path: Path, channels: list[tuple[str, str, np.ndarray, np.ndarray, str | None]], notes: list[str]
+) -> list[Sheet]:
+    """Return sheets of the channels (name, unit, times (n,), values (n,), start), one a clock.
+
+    A channel of arrays or objects, or one whose length is not that of its times, is left out with a note."""
+    found: dict[tuple[int, bytes, str | None], Sheet] = {}
+    names = [c[0] for c in channels]
+    for name, unit, t, values, start in channels:
+        if values.dtype.kind in "SO" and values.ndim == 1:
+            values = pa.array(
+                [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.tolist()]
             )
-        wrong = ~(np.diff(t) > 0)
-        if wrong.any() or not np.isfinite(t).all():
-            raise InputError(
-                f"{path}: row {int(wrong.argmax()) + 2}: channel '{name}': the time does not increase; "
-                "strictly increasing seconds were expected"
+        elif values.dtype.kind == "U" and values.ndim == 1:
+            values = pa.array(values.tolist())
+        elif values.ndim != 1 or values.dtype.kind not in "fiubmM":
+            notes.append(
+                f"channel '{name}' left out: each sample is {values.dtype} {values.shape[1:]}, no number"
             )
-    grid = channels[0][1]
-    if any(not np.array_equal(t, grid) for _, t, _ in channels):
-        grid = np.unique(np.concatenate([t for _, t, _ in channels]))
-    columns = {"t": grid.astype(np.float64)}
-    for name, t, values in channels:
-        if name in columns:
+            continue
+        elif values.dtype.kind in "iub":
+            values = values.astype(float)
+        if len(values) != len(t):
+            notes.append(f"channel '{name}' left out: {len(values)} values and {len(t)} times")
+            continue
+        wrong = np.flatnonzero(~(np.diff(t) > 0))
+        if not np.isfinite(t).all() or len(wrong):
+            row = int(wrong[0]) + 2 if len(wrong) else 1
+            raise InputError(
+                f"{path}: row {row}: channel '{name}': the time does not increase; strictly increasing seconds were expected"
+            )
+        key = (len(t), np.ascontiguousarray(t).tobytes(), start)
+        seconds = Seconds(np.asarray(t, float), start, "", "unit")
+        sheet = found.setdefault(key, Sheet({}, _row_of(path), clock=seconds, start=start))
+        if names.count(name) > 1 and name in [n for s in found.values() for n in s.columns]:
             raise InputError(
                 f"{path}: two channels are called '{name}'; export them under names of their own"
             )
-        column = np.full(len(grid), np.nan)
-        column[np.searchsorted(grid, t)] = values
-        columns[name] = column
-    return columns
+        sheet.columns[name] = values
+        if stated := spelled(unit, name):
+            sheet.units[name] = stated
+    return list(found.values())
 
 
-def read_mdf(path: Path) -> dict[str, np.ndarray]:
-    """Read the columns of an ASAM MDF file by channel name, with `t`. Raises InputError."""
+def _row_of(path: Path) -> Callable[[int], str]:
+    return lambda row: f"{path}: row {row + 1}"
+
+
+def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
+    """Read the channels of an ASAM MDF file (3 or 4), a sheet for each clock. Raises InputError."""
     asammdf = load("asammdf", path)
     path.stat()
+    found = []
     try:
         with asammdf.MDF(str(path)) as mdf:
-            found = [(s.name, np.asarray(s.timestamps), np.asarray(s.samples)) for s in mdf.iter_channels()]
+            begins = mdf.header.start_time
+            start = begins.replace(tzinfo=None).isoformat(timespec="milliseconds") if begins else None
+            for signal in mdf.iter_channels():
+                samples = np.asarray(signal.samples)
+                invalid = getattr(signal, "invalidation_bits", None)
+                if invalid is not None and samples.dtype.kind in "fiub":
+                    samples = np.where(np.asarray(invalid, bool), np.nan, samples)
+                if signal.name not in ("t", "time"):
+                    found.append(
+                        (signal.name, signal.unit or "", np.asarray(signal.timestamps), samples, start)
+                    )
     except Exception as e:  # asammdf raises any error on damaged bytes
         raise _damaged(path, "MDF", e) from None
-    return _united(path, [c for c in found if c[0] not in ("t", "time")])
+    return _timed(path, _own_names(found), notes)
 
 
-def read_tdms(path: Path) -> dict[str, np.ndarray]:
-    """Read the columns of a TDMS file by channel name, with `t`.
+def _own_names(channels: list[Any]) -> list[Any]:
+    """Return channels with a number behind each name that several groups use."""
+    names = [c[0] for c in channels]
+    seen: dict[str, int] = {}
+    found = []
+    for name, *rest in channels:
+        seen[name] = seen.get(name, 0) + 1
+        found.append((f"{name}_{seen[name]}" if names.count(name) > 1 else name, *rest))
+    return found
 
-    Raises InputError.
 
-    `t` comes from the waveform properties or from a channel `t` of the same group. A name that several groups
-    use becomes group_channel."""
+def read_tdms(path: Path, notes: list[str], group: str | None = None) -> list[Sheet]:
+    """Read a TDMS file: channels with a waveform by their clocks, the others of a group as a table.
+
+    A name that several groups use becomes group_channel. Raises InputError."""
     nptdms = load("nptdms", path)
     path.stat()
     try:
-        groups = [
-            (g.name, {c.name: (np.asarray(c[:]), dict(c.properties)) for c in g.channels()})
+        groups = {
+            g.name: {c.name: (np.asarray(c[:]), dict(c.properties)) for c in g.channels()}
             for g in nptdms.TdmsFile.read(str(path)).groups()
-        ]
+        }
     except Exception as e:  # npTDMS likewise
         raise _damaged(path, "TDMS", e) from None
-    names = [n for _, channels in groups for n in channels]
-    found = []
-    for group, channels in groups:
-        clock = channels.get("t", channels.get("t_s"))
+    if group is not None:
+        groups = {group: groups[_chosen(path, group, list(groups), "group")]}
+    names = [n for channels in groups.values() for n in channels]
+    waves: list[Any] = []
+    tables = []
+    for title, channels in groups.items():
+        clocked = any(n in ("t", "t_s") for n in channels)
+        rest = {}
         for name, (values, properties) in channels.items():
-            if name in ("t", "t_s"):
-                continue
             step = properties.get("wf_increment")
-            if clock is not None:
-                t = clock[0]
-            elif isinstance(step, int | float) and step > 0:
+            own = name if names.count(name) == 1 or (clocked and name in ("t", "t_s")) else f"{title}_{name}"
+            if isinstance(step, int | float) and step > 0 and len(values) and not clocked:
+                begins = properties.get("wf_start_time")
+                start = str(np.datetime64(begins, "us")) if begins is not None else None
                 t = float(properties.get("wf_start_offset", 0.0)) + step * np.arange(len(values))
+                waves.append((own, str(properties.get("unit_string", "")), t, values, start))
             else:
-                raise InputError(
-                    f"{path}: channel '{group}/{name}' has no time: no waveform step (wf_increment) and "
-                    "no channel 't' in its group"
-                )
-            if len(t) != len(values):
-                raise InputError(
-                    f"{path}: channel '{group}/{name}' has {len(values)} values and {len(t)} times"
-                )
-            found.append((name if names.count(name) == 1 else f"{group}_{name}", t, values))
-    return _united(path, found)
+                rest[own] = values, str(properties.get("unit_string", ""))
+        tables.append(_group(path, title, rest, notes))
+    found = _timed(path, waves, notes)
+    for table in tables:
+        if found and not any(isinstance(c, np.ndarray) for c in table.columns.values()):
+            notes += (
+                [f"channels of text without times left out: {', '.join(table.columns)}"]
+                if table.columns
+                else []
+            )
+        elif table.columns:
+            found.append(table)
+    return found
 
 
-def read_excel(path: Path) -> bytes:
-    """Return the first sheet of an Excel file as comma-separated text, row for row. Raises InputError."""
+def _group(path: Path, title: str, channels: dict[str, tuple[np.ndarray, str]], notes: list[str]) -> Sheet:
+    """Return the channels (values, unit) of a group as a table; another length is left out with a note."""
+    lengths = [len(v) for v, _ in channels.values() if len(v)]
+    rows = max(set(lengths), key=lengths.count) if lengths else 0
+    table = Sheet({}, _row_of(path), name=title)
+    for name, (values, unit) in channels.items():
+        if len(values) != rows or not rows:
+            notes.append(f"channel '{title}/{name}' left out: {len(values)} values; the others have {rows}")
+            continue
+        table.columns[name] = _column(values)
+        if stated := spelled(unit, name):
+            table.units[name] = stated
+    return table
+
+
+def _column(values: np.ndarray) -> Cells:
+    if values.dtype.kind in "iub":
+        return values.astype(float)
+    return values if values.dtype.kind in "fmM" else pa.array([str(v) for v in values.tolist()])
+
+
+def _chosen(path: Path, name: str, names: list[str], what: str) -> str:
+    if name not in names:
+        raise InputError(f"{path}: no {what} '{name}'{suggest(name, names)}; it has {', '.join(names)}")
+    return name
+
+
+def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
+    """Return the sheets of an Excel file, or the named one, as comma-separated text. Raises InputError."""
     openpyxl = load("openpyxl", path)
     path.stat()
+    found = []
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        for row in book.worksheets[0].iter_rows(values_only=True):
-            cells = [c.isoformat() if isinstance(c, date | time) else "" if c is None else c for c in row]
-            writer.writerow(cells)
+        titles = [w.title for w in book.worksheets]
+        for page in book.worksheets:
+            out = io.StringIO()
+            writer = csv.writer(out, lineterminator="\n")
+            for row in page.iter_rows(values_only=True) if sheet in (None, page.title) else ():
+                writer.writerow([_cell(c) for c in row])
+            found.append((page.title, out.getvalue().encode()))
         book.close()
     except Exception as e:  # openpyxl likewise
         raise _damaged(path, "Excel", e) from None
-    return out.getvalue().encode()
+    return found if sheet is None else [f for f in found if f[0] == _chosen(path, sheet, titles, "sheet")]
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, timedelta):
+        return f"{value.days} days {timedelta(seconds=value.seconds)}.{value.microseconds:06d}"
+    return value.isoformat() if isinstance(value, date | time) else "" if value is None else str(value)
+
+
+def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[Sheet]:
+    """Read a MATLAB file, 4 to 7.3: tables, timetables, structs, vectors. Raises InputError."""
+    matio = load("matio", path)
+    path.stat()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = matio.load_from_mat(str(path))
+    except Exception as e:  # any error on damaged bytes
+        raise _damaged(path, "MATLAB", e) from None
+    content = {k: v for k, v in content.items() if not k.startswith("__")}
+    if variable is not None:
+        content = {variable: content[_chosen(path, variable, list(content), "variable")]}
+    found: list[Sheet] = []
+    loose: dict[str, np.ndarray] = {}
+    for name, value in content.items():
+        if hasattr(value, "columns"):  # a data frame
+            columns: dict[str, Cells] = {str(c): _column(np.asarray(value[c])) for c in value.columns}
+            if value.index.dtype.kind in "mM":
+                columns = {str(value.index.name or "Time"): np.asarray(value.index), **columns}
+            found.append(Sheet(columns, _row_of(path), name=name))
+        elif len(columns := _vectors(value)) > 1:
+            found.append(Sheet(columns, _row_of(path), name=name))
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
+            loose[name] = np.squeeze(value).astype(float)
+    found += _of_vectors(path, loose) or ([] if found else _of_matrices(path, loose))
+    if len(found) > 1:
+        found.sort(key=len, reverse=True)
+        read = found[0].name or ", ".join(found[0].columns)
+        notes.append(f"'{read}' read, of {', '.join(content)} (another: --sheet VARIABLE)")
+    return found[:1]
+
+
+def _of_vectors(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
+    """Return vectors of one length as tables."""
+    found = []
+    for size in {len(v) for v in loose.values() if v.ndim == 1}:
+        columns: dict[str, Cells] = {n: v for n, v in loose.items() if v.ndim == 1 and len(v) == size}
+        if len(columns) > 1:
+            found.append(Sheet(columns, _row_of(path)))
+    return found
+
+
+def _of_matrices(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
+    """Return matrices as tables, the longer side as rows."""
+    found = []
+    for name, matrix in loose.items():
+        if matrix.ndim == 2:  # noqa: PLR2004
+            tall = matrix.T if matrix.shape[0] < matrix.shape[1] else matrix
+            found.append(
+                Sheet({f"column_{i + 1}": c for i, c in enumerate(tall.T)}, _row_of(path), name=name)
+            )
+    return found
+
+
+def _vectors(value: Any) -> dict[str, Cells]:
+    """Return the vectors of a struct, also of dSPACE's X.Data and Y(k).Name, Y(k).Data."""
+    if not isinstance(value, np.ndarray) or value.dtype.names is None or value.size != 1:
+        return {}
+    record = value.reshape(-1)[0]
+    fields = {n: record[n] for n in value.dtype.names}
+    if (
+        "X" in fields
+        and "Y" in fields
+        and "Data" in (fields["X"].dtype.names or ())
+        and fields["Y"].dtype.names
+    ):
+        found = {"time": np.ravel(fields["X"].reshape(-1)[0]["Data"]).astype(float)}
+        for y in fields["Y"].reshape(-1):
+            name = str(np.ravel(y["Name"])[0]).strip('"').rpartition("/")[2]
+            found[name] = np.ravel(y["Data"]).astype(float)
+    else:
+        found = {
+            n: np.ravel(v).astype(float)
+            for n, v in fields.items()
+            if isinstance(v, np.ndarray) and v.dtype.kind in "fiub" and v.size > 1 and v.size == max(v.shape)
+        }
+    rows = len(next(iter(found.values()), ()))
+    return dict(found) if all(len(v) == rows for v in found.values()) else {}
+
+
+def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
+    """Return the columns of a Parquet or Arrow file; nested ones are left out with a note."""
+    said = {
+        k.decode(errors="replace"): v.decode(errors="replace")
+        for k, v in (arrow.schema.metadata or {}).items()
+    }
+    sheet = Sheet(
+        {}, _row_of(path), meta={k: v for k, v in said.items() if k not in ("pandas", "ARROW:schema")}
+    )
+    for name, column, kind in zip(arrow.column_names, arrow.columns, arrow.schema, strict=True):
+        if name in sheet.columns:
+            raise InputError(f"{path}: the column '{name}' stands twice")
+        column = column.combine_chunks()
+        column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+        if pa.types.is_timestamp(column.type):
+            values: Cells = column.cast(pa.timestamp("ns", column.type.tz)).to_numpy(zero_copy_only=False)
+        elif pa.types.is_duration(column.type):
+            values = column.cast(pa.duration("ns")).to_numpy(zero_copy_only=False)
+        elif (
+            pa.types.is_string(column.type)
+            or pa.types.is_large_string(column.type)
+            or pa.types.is_date(column.type)
+            or pa.types.is_time(column.type)
+        ):
+            values = pc.fill_null(column.cast(pa.string()), "")
+        else:
+            try:
+                values = column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False).astype(float)
+            except (pa.ArrowException, ValueError):
+                sheet.notes.append(f"column '{name}' left out: {column.type} is no number")
+                continue
+        sheet.columns[name] = values
+        if unit := (kind.metadata or {}).get(b"unit", b"").decode(errors="replace"):
+            sheet.units[name] = unit
+    return sheet
 
 
 def write_mdf(path: str, table: Table) -> None:

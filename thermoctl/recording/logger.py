@@ -1,18 +1,23 @@
-"""Read the recording of any logger: CSV of every dialect, Excel, and the formats of `read_table`.
+"""Read the recording of any logger: text of every dialect, Excel, MATLAB, MDF, TDMS, Parquet, JSON.
 
-Our own files take the way of `read_table`: same speed, same errors. Other text is read in the dialect that
-its first lines show. Every guess is a note of the table; nothing is repaired silently.
+Our own files take the way of `read_table`: same speed, same errors. Every other file becomes sheets of
+cells. The whole column decides on the kind of its cells, and evidence decides which column is the time.
+Every guess is a note of the table; nothing is repaired silently.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
+import gzip
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,57 +25,159 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from thermoctl.recording import clock, files, formats
-from thermoctl.recording.clock import ClockError, Seconds
+from thermoctl.recording import axis, cells, clock, files, formats, layouts
+from thermoctl.recording.axis import Clock
+from thermoctl.recording.cells import CellError
+from thermoctl.recording.clock import ClockError
 from thermoctl.recording.dialect import (
-    MISSING,
     Dialect,
     cells_of,
     decoded,
     find_dialect,
-    is_number,
+    is_comment,
     lines,
-    split_unit,
+    stated_step,
 )
+from thermoctl.recording.sheet import Cells, Sheet
 from thermoctl.recording.table import Table
+from thermoctl.recording.units import split_unit
 from thermoctl.yamlfile import InputError, suggest
 
-TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc")
-EXCEL = (".xlsx", ".xlsm")
 HEAD = 65536  # bytes that decide whether a file is one of ours
+HOUR_S = 3600.0
+EQUAL_TIMES = ("spread", "mean", "first", "last")
+MAGIC = (
+    (b"MDF     ", "mdf"),
+    (b"UnFinMF ", "mdf"),
+    (b"TDSm", "tdms"),
+    (b"PK\x03\x04", "excel"),
+    (b"PAR1", "parquet"),
+    (b"ARROW1", "arrow"),
+    (b"\x89HDF", "mat"),
+    (b"MATLAB ", "mat"),
+    (b"\xd0\xcf\x11\xe0", "xls"),
+    (b"\x1f\x8b", "gzip"),
+)
+_SUFFIXES = {
+    ".mf4": "mdf",
+    ".mdf": "mdf",
+    ".tdms": "tdms",
+    ".xlsx": "excel",
+    ".xlsm": "excel",
+    ".parquet": "parquet",
+}
+_SUFFIXES |= {".arrow": "arrow", ".arrows": "arrow", ".feather": "arrow", ".mat": "mat"}
+
+
+@dataclass(frozen=True)
+class How:
+    """Choices of a person about the reading of a file; the reader finds the others.
+
+    - `time`: column of times
+    - `sheet`: sheet of Excel, group of TDMS, variable of MATLAB
+    - `missing`: further words and numbers for "no value"
+    - `decimal`: the decimal sign
+    - `run`: the one to read of several in a file, from 1
+    - `equal_times`: see EQUAL_TIMES
+    - `trace`: receives how the file was read, for people"""
+
+    time: str | None = None
+    sheet: str | None = None
+    missing: tuple[str, ...] = ()
+    decimal: str | None = None
+    run: int | None = None
+    equal_times: str | None = None
+    trace: list[str] = field(default_factory=list, compare=False)
 
 
 def read_recording(
-    path: str | Path, time: str | None = None, columns: Mapping[str, str] | None = None
+    path: str | Path, time: str | None = None, columns: Mapping[str, str] | None = None, **how: Any
 ) -> Table:
     """Read a recording of any logger. Raises InputError with file and line.
 
-    `time`: the column of times (default: by its name, else the first that increases). `columns` renames:
-    wanted name: name in the file. Units of the header are in `units`, guesses in `notes`."""
-    path = Path(path)
-    suffix = path.suffix.lower()
+    `time`: the column of times (default: by the evidence of all columns). `columns`: wanted name: name in
+    the file. `how`: the other fields of `How`. Units are in `units`, guesses in `notes`."""
+    path, said = Path(path), How(time, **how)
     try:
-        if path.is_dir() or suffix not in (*TEXT, *EXCEL):
-            table = _with_units(_of_columns(path, time) if time else files.read_table(path))
-        elif suffix in EXCEL:
-            table = _read_text(path, formats.read_excel(path), time, ())
-        elif time is None and _is_ours(path):
-            table = files.read_table(path)
-        else:
-            if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
-                raise InputError(
-                    f"{path}: {size} bytes; a text file of at most {files.MAX_CSV_BYTES} was expected "
-                    "(cut it in parts)"
+        if _is_ours(path, said):
+            try:
+                table = files.read_table(path)
+                said.trace.extend(
+                    ("format: " + _kind(path), "time: 't': a table of numbers with a time in seconds")
                 )
-            text, notes = decoded(path, path.read_bytes())
-            table = _read_text(path, text, time, notes)
+                return _renamed(table, columns or {})
+            except InputError:
+                if path.is_dir() or path.suffix.lower() not in _TEXT:
+                    raise
+        notes: list[str] = []
+        sheets = _sheets(path, said, notes)
+        table = _table(path, sheets, said, notes)
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
+    except pa.ArrowException as e:
+        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
     return _renamed(table, columns or {})
 
 
-def _is_ours(path: Path) -> bool:
-    """Whether `read_table` reads the file: commas, points, a column t or t_s, no units in the header."""
+_TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", "")
+
+
+def options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return what the options of a command say about its recordings, for `read_recording`."""
+    missing = next(csv.reader(io.StringIO(getattr(args, "missing", None) or "")), [])
+    return {
+        "time": args.time,
+        "columns": parsed_columns(args.columns),
+        "sheet": getattr(args, "sheet", None),
+        "missing": tuple(m.strip() for m in missing),
+        "decimal": getattr(args, "decimal", None),
+        "run": getattr(args, "run", None),
+        "equal_times": getattr(args, "equal_times", None),
+    }
+
+
+def print_notes(tables: Iterable[Table]) -> None:
+    """Print the reader's notes; one that several files share is printed once, with the first file's name."""
+    where: dict[str, list[str]] = {}
+    for table in tables:
+        for note in table.notes:
+            where.setdefault(note, []).append(table.path)
+    for note, paths in where.items():
+        also = f" (and {len(paths) - 1} more)" if len(paths) > 1 else ""
+        print(f"note: {paths[0]}{also}: {note}", file=sys.stderr)
+
+
+def _is_ours(path: Path, how: How) -> bool:
+    """Return whether `read_table` reads the file: columns of numbers with a time t or t_s, and no choices."""
+    if path.is_dir():
+        return True  # read_table says what was expected
+    if how != How():
+        return False
+    kind = _kind(path)
+    if kind == "text":
+        return path.suffix.lower() == ".csv" and _plain(path)
+    if kind == "arrow":
+        return True
+    if kind != "parquet":
+        return False
+    fields = pa.parquet.read_schema(path)
+    numbers = all(pa.types.is_floating(f.type) or pa.types.is_integer(f.type) for f in fields)
+    return numbers and bool({"t", "t_s"} & set(fields.names)) and not any(f.metadata for f in fields)
+
+
+def _kind(path: Path) -> str:
+    """Return the format by the first bytes, of an empty or damaged file by its suffix."""
+    with open(path, "rb") as f:
+        head = f.read(8)
+    suffix = path.suffix.lower()
+    if suffix in _SUFFIXES and (not head or suffix in (".arrow", ".arrows", ".feather")):
+        return _SUFFIXES[suffix]
+    found = next((kind for magic, kind in MAGIC if head.startswith(magic)), None)
+    return found or _SUFFIXES.get(suffix, "text")
+
+
+def _plain(path: Path) -> bool:
+    """Return whether a text has commas, points, t or t_s as its only time, and no units in the header."""
     with open(path, "rb") as f:
         head = f.read(HEAD)
     try:
@@ -88,70 +195,143 @@ def _is_ours(path: Path) -> bool:
         return False
     if not {"t", "t_s"} & set(names) or any(split_unit(n)[1] for n in names):
         return False
-    filled = [c for c in (rows[0] if rows else ()) if c not in MISSING]
-    at = names.index("t" if "t" in names else "t_s")
-    seconds = not rows or at >= len(rows[0]) or not clock.is_time(rows[0][at])
-    return seconds and (not filled or any(is_number(c, ".") for c in filled))
+    others = [
+        n
+        for n in names
+        if n not in ("t", "t_s", "wall_s") and {"time", "zeit", "date", "timestamp"} & set(axis.tokens(n))
+    ]
+    filled = [c for c in (rows[0] if rows else ()) if c and c.lower() != "nan"]
+    return not others and all(re.fullmatch(r"-?\d*\.?\d+(?:[eE][-+]?\d+)?|-?\d+\.", c) for c in filled)
 
 
-def _read_text(path: Path, text: bytes, time: str | None, notes: tuple[str, ...]) -> Table:
+def _sheets(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    """Read a file's sheets by its format."""
+    kind = _kind(path)
+    how.trace.append(f"format: {kind}")
+    if kind in _READERS:
+        return _READERS[kind](path, how, notes)
+    if kind == "xls":
+        raise InputError(f"{path}: an Excel file of before 2007; save it as .xlsx or .csv")
+    if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
+        raise InputError(
+            f"{path}: {size} bytes; a text file of at most {files.MAX_CSV_BYTES} was expected (cut it in parts)"
+        )
+    data = path.read_bytes()
+    if kind == "gzip":
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError) as e:
+            raise InputError(f"{path}: not a whole gzip file: {e}") from None
+    text, said = decoded(path, data)
+    notes += said
+    return _text(path, text, how, notes)
+
+
+def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    table = files.read_table(path)
+    return [Sheet({"t": table.t, **table.columns}, lambda row: f"{path}: row {row + 1}", meta=table.meta)]
+
+
+def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    """Return the named sheet of an Excel file, else the first that holds a table."""
+    pages = formats.read_excel(path, how.sheet)
+    first: InputError | None = None
+    for title, text in pages:
+        try:
+            here: list[str] = []
+            found = _text(path, text, how, here)
+            _table(path, found, how, list(here))
+        except InputError as e:
+            first = first or e
+            continue
+        if len(pages) > 1:
+            notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
+        notes += here
+        return found
+    raise first or InputError(f"{path}: no rows; at least one sample was expected")
+
+
+_READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
+    "mdf": lambda path, how, notes: formats.read_mdf(path, notes),
+    "tdms": lambda path, how, notes: formats.read_tdms(path, notes, how.sheet),
+    "mat": lambda path, how, notes: formats.read_mat(path, notes, how.sheet),
+    "parquet": lambda path, how, notes: [formats.read_arrow(path, pa.parquet.read_table(path))],
+    "arrow": _arrow,
+    "excel": _excel,
+}
+
+
+def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
+    """Read a text as sheets: a table of rows, or a layout of its own."""
     if b"\0" in text:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
-    lead = text[: 4 * HEAD].decode("utf-8", errors="ignore")
-    dialect = find_dialect(path, lead)
-    raw = _columns(path, text, dialect)
-    names = [n for n in dialect.names if n in raw]
-    chosen = _time_columns(path, names, raw, time)
-    try:
-        seconds, guess = _seconds(chosen, raw, dialect.units), _guess(chosen, time, names)
-    except ClockError as e:
-        line = _line(text, dialect, e.row)
-        raise InputError(f"{path}:{line}: column '{chosen[0]}': {e.reason}") from None
-    left = [n for n in names if n not in chosen and not isinstance(raw[n], np.ndarray)]
-    values = {n: v for n, v in raw.items() if isinstance(v, np.ndarray) and n not in (*chosen, "t")}
-    notes = (*notes, *dialect.notes, *filter(None, (guess, seconds.note)))
-    if left:
-        notes += (f"columns of text left out: {', '.join(left)}",)
-    meta = {"start": seconds.start} if seconds.start else {}
-    place = files.Raw({"t": seconds.t, **values}, meta, lambda row: f"{path}:{_line(text, dialect, row)}")
-    table = files.checked(path, place)
-    return replace(table, units={n: u for n, u in dialect.units.items() if n in values}, notes=notes)
+    if (special := layouts.special(path, text)) is not None:
+        return [p for s in special for p in layouts.pivoted(s) or [s]]
+    dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
+    how.trace.append(f"read as: {_described(dialect)}")
+    notes += dialect.notes
+
+    def closely() -> list[Sheet]:
+        """Read the rows cell by cell."""
+        return _stated(_slow(path, text, dialect), dialect)
+
+    sheet = _fast(path, text, dialect, how)
+    if sheet is None:
+        return closely()
+    found = _stated(sheet, dialect)
+    found[0].again = closely  # the error of that names the line
+    return found
 
 
-Column: TypeAlias = np.ndarray | pa.ChunkedArray
+def _described(dialect: Dialect) -> str:
+    shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(dialect.separator, f"'{dialect.separator}'")
+    return f"text, separator {shown}, data from line {dialect.first}"
 
 
-def _columns(path: Path, text: bytes, dialect: Dialect) -> dict[str, Column]:
-    """Numbers (float64) and texts by column; a column of numbers with a text in it is an error."""
+def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:
+    """Return a sheet with the units and the interval of its dialect; of a long table one a signal."""
+    sheet.units = dict(dialect.units)
+    sheet.decimal = dialect.decimal or ("," if dialect.separator == ";" else None)
+    if (stated := stated_step(dialect.facts)) is not None:
+        sheet.step_s, sheet.offset_s = stated
+    return layouts.pivoted(sheet) or [sheet]
+
+
+def _fast(path: Path, text: bytes, dialect: Dialect, how: How) -> Sheet | None:
+    """Read by Arrow: plain numbers as floats, other columns as texts; None where that cannot be right."""
+    decimal = how.decimal or dialect.decimal
+    if decimal is None or dialect.separator in (" ", "  ") or "" in dialect.names:
+        return None
     body = _body(text, dialect)
-    names = [n or f"\0{i}" for i, n in enumerate(dialect.names)]
-    strings = dialect.texts | dialect.times
-    kinds = {n: pa.string() if n in strings else pa.float64() for n in names}
+    if b"\n#" in body or b"\n%" in body or body[:1] in b"#%":
+        body = b"\n".join(x for x in body.splitlines() if not is_comment(x.decode("utf-8")))
+    names = list(dialect.names)
     try:
         arrow = pa.csv.read_csv(
             pa.BufferReader(body),
             pa.csv.ReadOptions(column_names=names),
             pa.csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
             pa.csv.ConvertOptions(
-                column_types=kinds, null_values=list(MISSING), decimal_point=dialect.decimal
+                column_types={n: pa.float64() if n in dialect.numeric else pa.string() for n in names},
+                null_values=["", "NaN", "nan", "NAN", "NA", "null"],
+                strings_can_be_null=False,
+                decimal_point=decimal,
             ),
         )
-    except pa.ArrowInvalid as e:
-        if not body.strip():
-            raise InputError(f"{path}: no rows; at least one sample was expected") from None
-        _refuse(path, text, dialect)
-        raise InputError(f"{path}: cannot be read as a table: {str(e).splitlines()[0]}") from None
+    except pa.ArrowInvalid:
+        return None
     if len(arrow) * len(names) > files.MAX_CELLS:
         raise InputError(
             f"{path}: {len(arrow)} rows; at most {files.MAX_CELLS} cells are read at once: cut it"
         )
-    return {
-        n: arrow[n].cast(pa.string()) if n in strings else files.to_numpy(arrow[n])
-        for n in names
-        if not (
-            n.startswith("\0") and arrow[n].null_count == len(arrow)
-        )  # a separator at the end of each line
-    }
+    columns = {n: _plain_column(arrow[n]) for n in names}
+    return Sheet(columns, lambda row: f"{path}:{_line(text, dialect, row)}")
+
+
+def _plain_column(column: pa.ChunkedArray) -> Cells:
+    if pa.types.is_floating(column.type):
+        return files.to_numpy(column)
+    return column.combine_chunks()
 
 
 def _body(text: bytes, dialect: Dialect) -> bytes:
@@ -161,29 +341,7 @@ def _body(text: bytes, dialect: Dialect) -> bytes:
         if at == 0:
             return b""
     body = text[at:]
-    return files.COMMENT.sub(b"", body) if b"#" in body else body
-
-
-def _refuse(path: Path, text: bytes, dialect: Dialect) -> None:
-    """Raise InputError for the first cell or row that is no part of the table."""
-    for line, content in lines(text.decode("utf-8")):
-        if line < dialect.first:
-            continue
-        cells = cells_of(content, dialect.separator)
-        if len(cells) != len(dialect.names):
-            raise InputError(
-                f"{path}:{line}: {len(cells)} cells; {len(dialect.names)} as in the header were expected"
-            )
-        for name, cell in zip(dialect.names, cells, strict=True):
-            known = (
-                cell in MISSING or is_number(cell, dialect.decimal) or name in dialect.texts | dialect.times
-            )
-            if not known:
-                sign = "comma" if dialect.decimal == "," else "point"
-                raise InputError(
-                    f"{path}:{line}: column '{name}': '{cell[:40]}' stands where a number with a decimal {sign} "
-                    "belongs (leave the cell empty where a sample is missing)"
-                )
+    return body if at < len(text) else b""
 
 
 def _line(text: bytes, dialect: Dialect, row: int) -> int:
@@ -192,116 +350,373 @@ def _line(text: bytes, dialect: Dialect, row: int) -> int:
     return next((n for i, n in enumerate(numbers) if i == row), dialect.first + row)
 
 
-def _time_columns(
-    path: Path, names: list[str], raw: Mapping[str, Column], time: str | None
-) -> tuple[str, ...]:
-    """Return the column of times, or a column of dates and one of times of day."""
-    if time is not None:
-        plain = split_unit(time)[0]
-        found = next((n for n in (time, plain) if n in names), None)
-        if found is None:
-            raise InputError(
-                f"{path}: no column '{time}'{suggest(time, names)}; the columns are {', '.join(names)}"
-            )
-        return (found,)
-    lower = {n if len(n) == 1 else n.lower(): n for n in reversed(names)}  # t is a time, T a temperature
-    date, of_day = (
-        next((lower[k] for k in keys if k in lower), None) for keys in (clock.DATES, clock.CLOCKS)
-    )
-    if date and of_day and ":" not in _first(raw[date]) and ":" in _first(raw[of_day]):
-        return date, of_day
-    for known in clock.NAMES:
-        if known in lower:
-            return (lower[known],)
-    first = names[0]
-    values = raw[first]
-    if not isinstance(values, np.ndarray):
-        if clock.is_time(str(values[0].as_py())):
-            return (first,)
-    elif len(values) > 1 and bool(np.all(np.diff(values) > 0)):
-        return (first,)
-    raise InputError(
-        f"{path}: no column 't' (time in seconds) and no other name of a time; the columns are {', '.join(names)}; "
-        "name it with --time COLUMN"
-    )
+def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
+    """Read row by row: repeated headers and a cut last line are left out with a note. Raises InputError."""
+    width = len(dialect.names)
+    headers = (list(dialect.header), [c for c in dialect.header if c])
+    rows: list[tuple[int, list[str]]] = []
+    odd: list[tuple[int, list[str]]] = []
+    again: list[str] = []
+    notes: list[str] = []
+    for line, content in lines(text.decode("utf-8")):
+        found = cells_of(content, dialect.separator) if line >= dialect.first else []
+        found = found[:-1] if len(found) == width + 1 and not found[-1] else found
+        if found and found in headers:
+            again.append(str(line))
+        elif any(found):
+            (rows if len(found) == width else odd).append((line, found))
+    while len(rows) > 1 and _is_footer(rows[-1][1], rows[0][1]):
+        odd.append(rows.pop())
+    if not rows:
+        raise InputError(f"{path}: no rows; at least one sample was expected")
+    if odd and min(odd)[0] < rows[-1][0]:
+        line, found = min(odd)
+        raise InputError(f"{path}:{line}: {len(found)} cells; {width} as in the header were expected")
+    if odd:
+        notes.append(
+            f"line{'s' if len(odd) > 1 else ''} {', '.join(str(n) for n, _ in odd[:3])} at the end left out: "
+            f"{len(odd[0][1])} cells of {width}, or words only (was the file cut off?)"
+        )
+    if again:
+        notes.append(f"the header stands again in line {', '.join(again[:5])}; left out")
+    numbers = [n for n, _ in rows]
+    columns = {n: pa.array([r[i] for _, r in rows], pa.string()) for i, n in enumerate(dialect.names)}
+    return Sheet(dict(columns), lambda row: f"{path}:{numbers[min(row, len(numbers) - 1)]}", notes=notes)
 
 
-def _first(column: Column) -> str:
-    return "" if isinstance(column, np.ndarray) or not len(column) else str(column[0].as_py())
+def _is_footer(row: Sequence[str], first: Sequence[str]) -> bool:
+    """Return whether a row holds words only, where the first one holds numbers or times."""
+
+    def any_value(cells_: Sequence[str]) -> bool:
+        """Return whether a cell is a number or a time."""
+        return any(cells.is_number(c) or clock.is_time(c) for c in cells_)
+
+    return any_value(first) and not any_value(row) and any(not cells.is_missing(c) for c in row)
 
 
-def _guess(chosen: tuple[str, ...], time: str | None, names: list[str]) -> str:
-    if time is not None or chosen[0] in ("t", "t_s"):
-        return ""
-    return f"time taken from column {' and '.join(repr(n) for n in chosen)} (another: --time COLUMN)"
+# ------------------------------------------------------------------------------------------- cells, clock, table
+def _table(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str]) -> Table:
+    """Return the table of a file's sheets, each timed by its own clock."""
+    try:
+        return _merged(path, sheets, how, notes)
+    except InputError:
+        if not sheets or sheets[0].again is None:
+            raise
+        return _merged(path, sheets[0].again(), how, notes)
 
 
-def _seconds(chosen: tuple[str, ...], raw: Mapping[str, Column], units: Mapping[str, str]) -> Seconds:
-    parts = [raw[n] for n in chosen]
-    first = parts[0]
-    if isinstance(first, np.ndarray):
-        return clock.from_numbers(first, units.get(chosen[0]) or _suffix(chosen[0]))
-    if len(parts) == 1:
-        return clock.from_texts(first)
-    return clock.from_texts(pc.binary_join_element_wise(*parts, " "))
-
-
-def _suffix(name: str) -> str | None:
-    """Return the unit that a name such as time_ms ends with."""
-    tail = name.rpartition("_")[2]
-    return tail if tail != name and tail in clock.SECONDS else None
-
-
-def _with_units(table: Table) -> Table:
-    """Return a Parquet file's table with the units that its fields state."""
-    path = Path(table.path)
-    if path.suffix.lower() != ".parquet":
-        return table
-    fields = pa.parquet.read_schema(path)
-    stated = {f.name: (f.metadata or {}).get(b"unit", b"").decode(errors="replace") for f in fields}
-    return replace(table, units={n: u for n, u in stated.items() if u and n in table.columns})
-
-
-def _of_columns(path: Path, time: str) -> Table:
-    """Read a file of columns by name (Parquet, Arrow, MDF4, TDMS) with another column as the time."""
-    reader = files.READERS.get(path.suffix.lower())
-    if reader is None or path.is_dir():
-        return files.read_table(path)  # which says what was expected
-    if path.suffix.lower() != ".parquet":
-        table = files.read_table(path)
-        if time not in table.columns:
-            raise InputError(
-                f"{path}: no column '{time}'{suggest(time, table.columns)}; the columns are {', '.join(table.columns)}"
-            )
-        rest = {n: v for n, v in table.columns.items() if n != time}
-        seconds = clock.from_numbers(table.columns[time], _suffix(time))
-    else:
+def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str]) -> Table:
+    parts: list[Table] = []
+    later: list[str] = []
+    for sheet in sheets:
         try:
-            arrow = pa.parquet.read_table(path)
-        except pa.ArrowException as e:
-            raise InputError(f"{path}: not a whole parquet file: {str(e).splitlines()[0]}") from None
-        if time not in arrow.column_names:
-            names = arrow.column_names
-            raise InputError(
-                f"{path}: no column '{time}'{suggest(time, names)}; the columns are {', '.join(names)}"
-            )
-        column = arrow[time]
-        if pa.types.is_timestamp(column.type):
-            ns = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64()).to_numpy()
-            start = str(np.datetime64(int(ns[0]) // 1_000_000, "ms"))
-            seconds = Seconds((ns - ns[0]) / 1e9, start, f"time from {start}")
+            values = _valued(path, sheet, how)
+        except CellError as e:
+            raise InputError(f"{sheet.place(e.row)}: {e.reason}") from None
+        parts += _timed(path, values, how)
+        later += values.notes
+    if not parts:
+        raise InputError(f"{path}: no channels with a time; at least one was expected")
+    table = parts[0] if len(parts) == 1 else _united(path, parts)
+    if not len(table):
+        raise InputError(f"{path}: no rows; at least one sample was expected")
+    every = tuple(dict.fromkeys([*notes, *later, *(n for p in parts for n in p.notes)]))
+    how.trace.extend(f"note: {n}" for n in every)
+    return replace(table, notes=every)
+
+
+def _valued(path: Path, sheet: Sheet, how: How) -> Sheet:
+    """Return a sheet whose columns are numbers, times, or texts that are neither. Raises CellError."""
+    texts = {n: c for n, c in sheet.columns.items() if not isinstance(c, np.ndarray)}
+    decimal = how.decimal or _decimal(texts.values(), sheet)
+    found = replace(sheet, columns={}, units=dict(sheet.units), notes=list(sheet.notes))
+    left = []
+    for name, column in sheet.columns.items():
+        if isinstance(column, np.ndarray):
+            found.columns[name] = _without(column, how.missing)
+            continue
+        try:
+            values = _of_texts(name.partition("\0")[0], column, decimal, how.missing, found.notes)
+        except CellError as e:
+            raise CellError(e.row, f"column '{name.partition(chr(0))[0]}': {e.reason}") from None
+        if isinstance(values, cells.Numbers):
+            found.columns[name] = _without(values.values, how.missing)
+            found.notes += values.notes
+            stated = found.units.get(name)
+            if values.unit and stated and stated != values.unit:
+                raise CellError(
+                    0,
+                    f"column '{name}': its header says {stated}, its cells {values.unit}; one unit was expected",
+                )
+            if values.unit:
+                found.units[name] = values.unit
+        elif values is not None:
+            found.columns[name] = values
         else:
-            seconds = clock.from_numbers(files.to_numpy(column.cast(pa.float64())), _suffix(time))
-        numbers = [
-            f.name for f in arrow.schema if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)
-        ]
-        rest = {n: files.to_numpy(arrow[n].cast(pa.float64())) for n in numbers if n != time}
-    raw = files.Raw(
-        {"t": seconds.t, **{n: v for n, v in rest.items() if n != "t"}},
-        {},
-        lambda row: f"{path}: row {row + 1}",
+            left.append(name.partition("\0")[0].strip() or f"column {list(sheet.columns).index(name) + 1}")
+    if left:
+        found.notes.append(f"columns of text left out: {', '.join(left)}")
+    return found
+
+
+def _without(values: np.ndarray, missing: Sequence[str]) -> np.ndarray:
+    """Return numbers without those that stand for "no value"."""
+    for word in missing:
+        try:
+            number = float(word.replace(",", "."))
+        except ValueError:
+            continue
+        if values.dtype.kind == "f":
+            values = np.where(values == number, np.nan, values)
+    return values
+
+
+def _of_texts(
+    name: str, column: pa.Array, decimal: str | None, missing: Sequence[str], notes: list[str]
+) -> cells.Numbers | pa.Array | None:
+    tidy, empty, _ = cells.words(column, missing)
+    filled = tidy.filter(pc.invert(empty))
+    if not len(filled):
+        return cells.numbers(name, column, decimal, missing)
+    if pc.all(pc.match_substring_regex(filled, r"^\d{15,20}$")).as_py():
+        return pc.if_else(empty, "", tidy)
+    right = clock.times(filled)
+    share = float(np.mean(right))
+    if share == 1.0:
+        return pc.if_else(empty, "", tidy)
+    if share >= 0.5 and not all(cells.is_number(t) for t in filled.filter(pa.array(~right)).to_pylist()[:1]):  # noqa: PLR2004
+        row = int(np.flatnonzero(~empty.to_numpy(zero_copy_only=False))[int(np.argmin(right))])
+        raise CellError(
+            row,
+            f"'{column[row].as_py()[:40]}' is no date or time; one such as 2026-03-14T09:26:53.5 was expected",
+        )
+    return cells.numbers(name, column, decimal, missing)
+
+
+def _decimal(texts: Iterable[Any], sheet: Sheet) -> str | None:
+    """Return the decimal sign that all cells show; else that of the file's first lines."""
+    shown: set[str] = set()
+    for column in texts:
+        filled = column.filter(pc.invert(cells.words(column)[1]))
+        if len(filled) and cells.differs(filled) and len(signs := cells.decimal_signs(filled)) == 1:
+            shown |= signs
+    if len(shown) > 1:
+        return None
+    if shown == {"."} and sheet.decimal == ",":
+        return "."
+    return next(iter(shown), sheet.decimal)
+
+
+def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
+    """Return the tables of a sheet: one for each of its clocks, with the columns that hold numbers."""
+    if not any(len(c) for c in sheet.columns.values()):
+        raise InputError(f"{path}: no rows; at least one sample was expected")
+    found: list[Table] = []
+    several = _clocks(path, sheet, how)
+    for timer, names in several:
+        t = np.full(len(sheet), np.nan)
+        t[: len(timer.seconds.t)] = timer.seconds.t
+        values: dict[str, np.ndarray] = {}
+        notes = [_clock_note(timer, how)]
+        for name in names:
+            column = sheet.columns[name]
+            plain = name.partition("\0")[0].strip()
+            if not isinstance(column, np.ndarray) or column.dtype.kind != "f":
+                notes.append(f"another time left out: {plain}")
+                continue
+            if name.strip() != plain or not plain:
+                _refuse_name(path, sheet, name, plain, column)
+                if not plain:
+                    continue
+            values[plain] = column
+        t, values, place = _rows(path, sheet, t, values, len(several) > 1, how, notes)
+        for name, column in values.items():
+            if np.isinf(column).any():
+                raise InputError(
+                    f"{place(int(np.isinf(column).argmax()))}: column '{name}': an infinite value; a finite number was "
+                    "expected (leave the cell empty where a sample is missing)"
+                )
+        units = {n: u for n, u in sheet.units.items() if n in values}
+        start = timer.seconds.start or sheet.start
+        if timer.seconds.start and len(t) and t[0] != 0:
+            start, t = _moved(timer.seconds.start, float(t[0])), t - t[0]
+        meta = sheet.meta | ({"start": start} if start else {})
+        found.append(
+            Table(path.stem, str(path), t, values, meta, units, tuple(filter(None, notes)), recorded=True)
+        )
+        _trace(how, timer, found[-1])
+    return found
+
+
+def _moved(start: str, seconds: float) -> str:
+    """Return a date some seconds later."""
+    later = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
+    return f"{later}Z" if start.endswith("Z") else str(later)
+
+
+def _refuse_name(path: Path, sheet: Sheet, name: str, plain: str, column: np.ndarray) -> None:
+    if not np.isfinite(column).any() or name == " ":
+        return
+    if not plain:
+        position = list(sheet.columns).index(name)
+        raise InputError(f"{path}: column {position + 1} of {len(sheet.columns)} has no name in the header")
+    raise InputError(f"{sheet.place(0)}: the column '{plain}' stands twice in the header; rename one")
+
+
+def _clock_note(timer: Clock, how: How) -> str:
+    plain = timer.columns == ("t",) or timer.columns == ("t_s",)
+    if how.time is not None or not timer.why or (plain and timer.seconds.kind in ("unit", "bare")):
+        return "" if timer.seconds.kind in ("unit", "bare") and not how.time else timer.seconds.note
+    return timer.note + " (another: --time COLUMN)"
+
+
+def _trace(how: How, timer: Clock, table: Table) -> None:
+    said = "; ".join(filter(None, (timer.why, timer.seconds.note)))
+    how.trace.append(f"time: {timer.where}: {said}")
+    how.trace.extend(f"column: {n} [{table.units.get(n, 'no unit stated')}]" for n in table.columns)
+
+
+def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]:
+    """Return the clocks of a sheet with the columns of each. Raises InputError with file and line."""
+    names = list(sheet.columns)
+    if how.time is None and sheet.clock is not None:
+        return [(Clock(("time of the channel",), sheet.clock, 0, ""), names)]
+    if how.time is not None:
+        plain = split_unit(how.time)[0]
+        chosen = next((n for n in (how.time, plain) if n in names), None)
+        if chosen is None:
+            known = [n for n in names if n.strip() and "\0" not in n]
+            raise InputError(
+                f"{path}: no column '{how.time}'{suggest(how.time, known)}; the columns are {', '.join(known)}"
+            )
+        try:
+            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen))
+        except ClockError as e:
+            raise InputError(f"{sheet.place(e.row)}: column '{chosen}': {e.reason}") from None
+        return [(Clock((chosen,), seconds, 0, ""), [n for n in names if n != chosen])]
+    try:
+        return axis.clocks(sheet)
+    except ClockError as e:
+        raise InputError(f"{sheet.place(e.row)}: {e.reason}") from None
+    except LookupError as e:
+        shown = ", ".join(n for n in names if n.strip() and "\0" not in n)
+        raise InputError(
+            f"{path}: no column 't' (time in seconds) and no other that is a time for sure ({e}); the columns are {shown}; "
+            "name it with --time COLUMN"
+        ) from None
+
+
+def _rows(
+    path: Path,
+    sheet: Sheet,
+    t: np.ndarray,
+    values: dict[str, np.ndarray],
+    several: bool,
+    how: How,
+    notes: list[str],
+) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
+    """Return times and values in the order of time. Raises InputError for missing, equal or earlier times."""
+    rows = np.arange(len(t))
+    missing = ~np.isfinite(t)
+    if missing.any():
+        filled = np.any([np.isfinite(v) for v in values.values()], axis=0) if values else missing
+        if (missing & filled).any():
+            row = int((missing & filled).argmax())
+            raise InputError(
+                f"{sheet.place(row)}: the time is missing; a finite number or a date was expected"
+            )
+        rows = rows[~missing]
+    if len(rows) > 1 and (np.diff(t[rows]) < 0).all():
+        rows = rows[::-1]
+        notes.append("the rows run backwards in time; turned round")
+    rows = _one_run(sheet, t, rows, how, notes)
+    t, values = t[rows], {n: v[rows] for n, v in values.items()}
+    if (np.diff(t) == 0).any():
+        t, values = _distinct(sheet, t, values, rows, how, notes)
+    if several is False and len(t) and sheet.clock is None and how.run not in (None, 1):
+        t = t - t[0]
+    return t, values, lambda row: sheet.place(int(rows[min(row, len(rows) - 1)]))
+
+
+def _one_run(sheet: Sheet, t: np.ndarray, rows: np.ndarray, how: How, notes: list[str]) -> np.ndarray:
+    back = np.flatnonzero(np.diff(t[rows]) < 0)
+    if not len(back) and how.run in (None, 1):
+        return rows
+    parts = np.split(rows, back + 1)
+    if how.run is not None:
+        if not 1 <= how.run <= len(parts):
+            raise InputError(f"{sheet.place(0)}: --run {how.run}: the file holds {len(parts)} run(s)")
+        if len(parts) > 1:
+            notes.append(f"run {how.run} of {len(parts)} read")
+        return np.asarray(parts[how.run - 1])
+    row, before = int(rows[back[0] + 1]), int(rows[back[0]])
+    jump = float(t[before] - t[row])
+    usual = float(np.median(np.abs(np.diff(t[rows]))))
+    hour = " by an hour (daylight saving?)" if abs(jump + usual - HOUR_S) <= max(1.5 * usual, 1.0) else ""
+    raise InputError(
+        f"{sheet.place(row)}: the time {t[row]:.17g} runs backwards from {t[before]:.17g}{hour}: {len(parts)} runs in one "
+        f"file? --run 1 reads the first, up to --run {len(parts)}"
     )
-    return replace(files.checked(path, raw), notes=(seconds.note,) if seconds.note else ())
+
+
+def _distinct(
+    sheet: Sheet, t: np.ndarray, values: dict[str, np.ndarray], rows: np.ndarray, how: How, notes: list[str]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Give rows of one time times of their own, or make one row of them, as the option says."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(t) != 0) + 1])
+    counts = np.diff(np.concatenate([starts, [len(t)]]))
+    if how.equal_times is None:
+        row = int(np.flatnonzero(np.diff(t) == 0)[0]) + 1
+        raise InputError(
+            f"{sheet.place(int(rows[row]))}: the time {t[row]:.17g} stands twice; strictly increasing seconds were expected "
+            "(--equal-times spread: rows of one time at even steps to the next; mean, first or last: one row of them)"
+        )
+    notes.append(f"{int((counts - 1).sum())} rows of equal times: {how.equal_times}")
+    if how.equal_times == "spread":
+        distinct = t[starts]
+        steps = np.diff(distinct)
+        usual = float(np.median(steps)) if len(steps) else 1.0
+        gap = np.minimum(np.append(steps, usual), 2 * usual)
+        # A last second that was cut goes on at the pace of the others.
+        pace = np.append(counts[:-1], max(counts[-1], int(np.median(counts))))
+        within = np.arange(len(t)) - np.repeat(starts, counts)
+        return np.repeat(distinct, counts) + within * np.repeat(gap / pace, counts), values
+    if how.equal_times == "mean":
+        found = {}
+        for n, v in values.items():
+            seen = np.add.reduceat(np.isfinite(v).astype(float), starts)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                found[n] = np.add.reduceat(np.nan_to_num(v), starts) / seen
+        return t[starts], found
+    pick = starts if how.equal_times == "first" else starts + counts - 1
+    return t[pick], {n: v[pick] for n, v in values.items()}
+
+
+def _united(path: Path, parts: Sequence[Table]) -> Table:
+    """Merge tables of different clocks: rows at the union of all times, empty where a column has none."""
+    starts = [p.meta.get("start") for p in parts]
+    offsets = np.zeros(len(parts))
+    first = min((s for s in starts if s), default=None)
+    if all(starts):
+        since = [np.datetime64(str(s).removesuffix("Z"), "us") for s in starts]
+        offsets = np.array([float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since])
+    times = [p.t + o for p, o in zip(parts, offsets, strict=True)]
+    every = np.sort(np.concatenate(times))
+    steps = [float(np.median(np.diff(t))) for t in times if len(t) > 1]
+    near = 1e-6 * min(steps, default=1.0)
+    grid = every[np.concatenate([[True], np.diff(every) > near])]
+    columns: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    for part, t in zip(parts, times, strict=True):
+        at = np.searchsorted(grid, t - near)
+        for name, values in part.columns.items():
+            if name in columns:
+                raise InputError(f"{path}: the column '{name}' stands twice; rename one")
+            columns[name] = np.full(len(grid), np.nan)
+            columns[name][at] = values
+        units |= part.units
+    meta = {"start": first} if first and all(starts) else {}
+    return Table(path.stem, str(path), grid, columns, meta, units, recorded=True)
 
 
 def _renamed(table: Table, columns: Mapping[str, str]) -> Table:

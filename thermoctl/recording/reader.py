@@ -16,8 +16,10 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from thermoctl.recording import formats
-from thermoctl.recording.files import read_table, to_arrow
+from thermoctl.recording.files import READERS, read_table, to_arrow
+from thermoctl.recording.logger import read_recording
 from thermoctl.recording.stream import END, open_stream
+from thermoctl.recording.table import Table
 from thermoctl.rig.signals import of_recording
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError, suggest
@@ -152,7 +154,7 @@ def export(
 def _export_table(
     path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
 ) -> int:
-    table = read_table(path, want)
+    table = _table(path, want)
     a, b = np.searchsorted(table.t, [begin_s, end_s])
     if a == b:
         raise InputError(
@@ -172,6 +174,16 @@ def _export_table(
             else:
                 pa.parquet.write_table(to_arrow(table), f, compression="zstd")
     return len(table)
+
+
+def _table(path: Path, want: list[str] | None) -> Table:
+    if path.suffix.lower() in READERS:
+        return read_table(path, want)
+    table = read_recording(path)
+    for name in want or ():
+        if name not in table.columns:
+            raise InputError(f"{path}: no column '{name}'{suggest(name, table.columns)}")
+    return table if want is None else dataclasses.replace(table, columns={n: table.columns[n] for n in want})
 
 
 def _export_stream(

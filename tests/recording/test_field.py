@@ -1,0 +1,169 @@
+"""What a file says: the clock by evidence, cells in every spelling, damage at its end; nothing is dropped in silence."""
+
+import numpy as np
+import pytest
+
+from thermoctl.recording.logger import read_recording
+from thermoctl.yamlfile import InputError
+
+ISO = "2026-03-01 10:00:0"
+
+
+def read(folder, text, **how):
+    path = folder / "run.csv"
+    path.write_text(text)
+    return read_recording(path, **how)
+
+
+def table(head, *rows):
+    return head + "\n" + "\n".join(rows) + "\n"
+
+
+CLOCKS = {
+    "a counter before seconds": (table("Sample,Time_sec,T", "0,0.0,20", "1,0.5,21", "2,1.0,22"), [0, 0.5, 1]),
+    "a counter before a date": (table("Index,Date and time,T", *(f"{i},{ISO}{i},2{i}" for i in range(3))), [0, 1, 2]),
+    "a date after the values": (table("T,P,stamp", *(f"2{i},{i},{ISO}{i}" for i in range(3))), [0, 1, 2]),
+    "a rising temperature first": (table("T_block,elapsed", "20,0", "21,10", "22,20"), [0, 10, 20]),
+    "t is a signal": (table("time,t,T", "0,20.0,1", "10,20.5,2", "20,21.0,3"), [0, 10, 20]),
+    "hours": (table("Time (hours),T", "0.0,20", "0.5,21", "1,22"), [0, 1800, 3600]),
+    "a unit as a word of the name": (table("elapsed_minutes,T", "0,20", "1,21", "2,22"), [0, 60, 120]),
+    "Stunden": (table("Zeit in Stunden;T", "0,0;20", "0,5;21", "1,0;22"), [0, 1800, 3600]),
+    "days of Excel": (table("Date/Time,T", "46082.4166666667,20", "46082.4166782408,21", "46082.4166898148,22"), [0, 1, 2]),
+    "seconds since 1904": (table("Timestamp,T", "3855204000.0,20", "3855204000.5,21", "3855204001.0,22"), [0, 0.5, 1]),
+    "compact dates": (table("time,T", "20260301105958,20", "20260301105959,21", "20260301110000,22"), [0, 1, 2]),
+    "compact dates with milliseconds": (table("time,T", "20260301105959500,20", "20260301110000000,21"), [0, 0.5]),
+    "date and time as numbers": (table("Date,Time,T", "20260301,95959,20", "20260301,100000,21"), [0, 1]),
+    "unix nanoseconds": (table("time,T", "1772359200000000000,20", "1772359200000001000,21"), [0, 1e-6]),
+    "date, time, milliseconds": (table("Date,Time,ms,T", "2026/03/01,10:00:00,0,20", "2026/03/01,10:00:00,500,21"), [0, 0.5]),
+    "a zone's name": (table("time,T", f"{ISO}0 CET,20", f"{ISO}1 CET,21"), [0, 1]),
+    "summer time by the zone": (table("time,T", "2026-03-29 01:59:59 CET,20", "2026-03-29 03:00:00 CEST,21"), [0, 1]),
+    "a time of day over a counter": (table("No,Uhrzeit,T", "1,23:59:59,20", "2,00:00:00,21"), [0, 1]),
+    "minutes and seconds": (table("time,T", "10:59.5,20", "11:00.0,21"), [0, 0.5]),
+    "newest first": (table("time,T", f"{ISO}1,21", f"{ISO}0,20"), [0, 1]),
+    "a counter, for want of times": (table("#;T", "1;20", "2;21", "3;22"), [1, 2, 3]),
+    "an interval above the header": (table("Sampling interval: 0.5 s", "T,P", "20,1", "20,2", "20,3"), [0, 0.5, 1]),
+    "a date of day once, and seconds": (table("date,seconds,T", "2026-03-01,0,20", "2026-03-01,0.5,21"), [0, 0.5]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text, t", CLOCKS.values(), ids=CLOCKS)
+def test_evidence_finds_the_clock(tmp_path, text, t):
+    found = read(tmp_path, text)
+    np.testing.assert_allclose(found.t, t, atol=1e-9)
+    assert any(n.startswith("time from ") for n in found.notes)
+
+
+def test_an_assumed_unit_is_said(tmp_path):
+    assert any("assumed: s" in n for n in read(tmp_path, table("time,T", "0,20", "1,21")).notes)
+    assert any("a counter" in n for n in read(tmp_path, CLOCKS["a counter, for want of times"][0]).notes)
+
+
+def test_two_clocks_are_two_tables(tmp_path):
+    found = read(
+        tmp_path, table("Time1,CH1,Time2,CH2", "0.0,20,0.0,0", "0.1,21,0.2,1", "0.2,22,0.4,2", "0.3,23,,")
+    )
+    np.testing.assert_allclose(found.t, [0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(found.columns["CH2"], [0, np.nan, 1, np.nan, 2])
+    assert list(found.columns) == ["CH1", "CH2"]
+
+
+CELLS = {
+    "on and off": (("OFF", "OFF", "ON"), [0, 0, 1]),
+    "true and false": (("False", "True", "false"), [0, 1, 0]),
+    "an und aus": (("aus", "ein", ""), [0, 1, np.nan]),
+    "thousands": (('"1,100.5"', '"12,101"', '"-1,234,567.25"'), [1100.5, 12101, -1234567.25]),
+    "thousands by blanks": (("1 100.5", "12 101", "0"), [1100.5, 12101, 0]),
+    "Swiss thousands": (("1'100.5", "12’101", "0"), [1100.5, 12101, 0]),
+    "minus signs": (("−5", "–6", "- 7"), [-5, -6, -7]),
+    "minus behind, brackets": (("5-", "(6)", "+ 7"), [-5, -6, 7]),
+    "quoted decimals": (('"20,5"', '"21,25"', '"-0,5"'), [20.5, 21.25, -0.5]),
+    "Fortran": (("1.0D+03", "-2.5d-01", "0.D0"), [1000, -0.25, 0]),
+    "units in cells": (("20 °C", "21.5°C", "n/a"), [20, 21.5, np.nan]),
+    "mixed prefixes": (("500 mW", "1.2 W", "0 mW"), [500, 1200, 0]),
+    "percent": (("10%", "20 %", ""), [10, 20, np.nan]),
+    "no value": (("unavailable", "OVF", "3"), [np.nan, np.nan, 3]),
+    "no value of Excel": (("#N/A", "#DIV/0!", "3"), [np.nan, np.nan, 3]),
+}
+
+
+@pytest.mark.parametrize("cells, values", CELLS.values(), ids=CELLS)
+def test_cells_in_every_spelling(tmp_path, cells, values):
+    found = read(tmp_path, table("time,x", *(f"{i},{c}" for i, c in enumerate(cells))))
+    np.testing.assert_allclose(found.columns["x"], values)
+    assert found.units == (
+        {"x": {"°": "degC", "m": "mW", "%": "%"}[u]}
+        if (u := next((u for u in "°m%" if u in cells[0]), ""))
+        else {}
+    )
+
+
+def test_the_whole_column_decides(tmp_path):
+    rows = [f"{i},unavailable,0" for i in range(450)] + [f"{i},{i / 10},1" for i in range(450, 470)]
+    found = read(tmp_path, table("time,T,P", *rows))
+    assert np.isnan(found.columns["T"]).sum() == 450 and found.columns["T"][-1] == 46.9
+    assert any("'unavailable' read as no value" in n for n in found.notes)
+    rows = [f"{i},2{i % 10}.00," for i in range(450)] + ["450,21.0,door opened"]
+    found = read(tmp_path, table("time,T,note", *rows))
+    assert list(found.columns) == ["T"] and any("text left out: note" in n for n in found.notes)
+    rows = [f"{i},not ready" for i in range(450)] + [f"{i},{i / 10}" for i in range(450, 470)]
+    with pytest.raises(InputError, match=r":2: column 'T': 'not ready' .*--missing 'not ready'"):
+        read(tmp_path, table("time,T", *rows))
+    assert np.isnan(read(tmp_path, table("time,T", *rows), missing=("not ready",)).columns["T"]).sum() == 450
+
+
+def test_a_number_that_means_no_value(tmp_path):
+    found = read(tmp_path, table("t,T", "0,20.5", "1,-9999", "2,21"), missing=("-9999",))
+    np.testing.assert_array_equal(found.columns["T"], [20.5, np.nan, 21])
+
+
+def test_two_readings_of_a_number_are_an_error(tmp_path):
+    text = table("time,x", '0,"1,100"', '1,"1,200"')
+    with pytest.raises(InputError, match=r":2: column 'x': '1,100' .*--decimal"):
+        read(tmp_path, text)
+    assert read(tmp_path, text, decimal=".").columns["x"].tolist() == [1100, 1200]
+    assert read(tmp_path, text, decimal=",").columns["x"].tolist() == [1.1, 1.2]
+    other = table("time,x,y", '0,"1,100",20.5', '1,"1,200",20.5')
+    assert read(tmp_path, other).columns["x"].tolist() == [1100, 1200]
+
+
+def test_damage_is_said(tmp_path):
+    found = read(tmp_path, "time,T,P\n0,20,0\n1,21,1\n2,2")
+    assert found.t.tolist() == [0, 1] and any("line 4 at the end left out" in n for n in found.notes)
+    found = read(tmp_path, table("time,T", "0,20", "1,21", "time,T", "2,22"))
+    assert found.t.tolist() == [0, 1, 2] and any(
+        "the header stands again in line 4" in n for n in found.notes
+    )
+    with pytest.raises(InputError, match=r":3: 1 cells; 2 as in the header"):
+        read(tmp_path, table("time,T", "0,20", "1", "2,22"))
+    with pytest.raises(InputError, match=r":3: column 'time': '2026-03-01 10:0' is no date"):
+        read(tmp_path, table("time,n,T", f"{ISO}0,1,20", "2026-03-01 10:0,2,21", f"{ISO}2,3,22"))
+
+
+def test_two_runs_in_one_file(tmp_path):
+    text = table("time,T", "0,20", "1,21", "time,T", "0,30", "1,31", "2,32")
+    with pytest.raises(
+        InputError, match=r":5: the time 0 runs backwards from 1: 2 runs in one file\? --run 1"
+    ):
+        read(tmp_path, text)
+    assert read(tmp_path, text, run=1).columns["T"].tolist() == [20, 21]
+    assert read(tmp_path, text, run=2).columns["T"].tolist() == [30, 31, 32]
+    hour = table("time,T", "2026-10-25 02:59:58,20", "2026-10-25 02:59:59,21", "2026-10-25 02:00:00,22")
+    with pytest.raises(InputError, match="by an hour .daylight saving"):
+        read(tmp_path, hour)
+
+
+@pytest.mark.parametrize(
+    "choice, t, x",
+    [
+        ("spread", [0, 0.5, 1, 1.5, 2, 2.5], [20, 21, 22, 23, 24, 25]),
+        ("mean", [0, 1, 2], [20.5, 22.5, 24.5]),
+        ("first", [0, 1, 2], [20, 22, 24]),
+        ("last", [0, 1, 2], [21, 23, 25]),
+    ],
+)
+def test_equal_seconds_are_a_choice(tmp_path, choice, t, x):
+    text = table("time,T", *(f"{ISO}{i // 2},{20 + i}" for i in range(6)))
+    with pytest.raises(InputError, match=r":3: the time 0 stands twice.*--equal-times spread"):
+        read(tmp_path, text)
+    found = read(tmp_path, text, equal_times=choice)
+    assert found.t.tolist() == t and found.columns["T"].tolist() == x

@@ -1,0 +1,373 @@
+"""The time axis of a table, by evidence: each column that can be a clock collects points, the most win.
+
+Points come from the kind of its cells (dates, times of day, numbers of an epoch), and from name and unit in
+any language. Further points are for a column that increases, and evenly. A counter is the last resort.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from thermoctl.recording import clock
+from thermoctl.recording.clock import ClockError, Seconds
+from thermoctl.recording.sheet import Cells, Sheet
+from thermoctl.recording.units import SECONDS, WORDS, known, spelled
+
+KINDS = {
+    "date and time": 60,
+    "date": 30,
+    "time of day": 45,
+    "duration": 45,
+    "epoch": 35,
+    "unit": 35,
+    "bare": 0,
+}
+STEP = 50  # points of an interval that the file states
+NAMED, COUNTED, FOREIGN = 30, -30, -60  # a name of times; of a counter; a unit that is none of time
+STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
+NEEDED = 30  # points from which a column is a clock
+SURE = 60  # points from which a clock stands, though another column holds wrong dates
+COUNTER = 1.0  # step of a counter
+MILLI = 1000
+_TIMES = WORDS["times"].split()
+_COUNTERS = WORDS["counters"].split()
+_OTHERS = WORDS["other_times"].split()
+_PARTS = re.compile(r"[^\W\d_]+|#|n[°º]", re.UNICODE)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A clock and its columns; `why`: the evidence, for people; `counter`: it counts rows."""
+
+    columns: tuple[str, ...]
+    seconds: Seconds
+    points: float
+    why: str
+    counter: bool = False
+
+    @property
+    def note(self) -> str:
+        """Return how the time was read, for people."""
+        return f"time from {self.where}" + (f": {self.seconds.note}" if self.seconds.note else "")
+
+    @property
+    def where(self) -> str:
+        """Return the columns' names for people."""
+        return (
+            " and ".join(repr(c.strip()) if c.strip() else "the first column" for c in self.columns)
+            or "the rows"
+        )
+
+    def plus(self, points: float) -> Clock:
+        """Return the clock with further points."""
+        return replace(self, points=self.points + points)
+
+
+def tokens(name: str) -> list[str]:
+    """Return the words of a name in lower case: time, ms of `Time_ms` and of `timeMs`."""
+    split = re.sub(r"([a-zäöü])([A-Z])", r"\1 \2", name)
+    return [p.lower() for p in _PARTS.findall(split)]
+
+
+def named(name: str) -> int:
+    """Return points for a name: of times in any language, of a counter, of another time than the clock."""
+    words = tokens(name)
+    if name.strip() == "T":  # t is a time, T a temperature
+        return 0
+    if any(w in _OTHERS for w in words):
+        return -NAMED
+    if re.fullmatch(r"t|ts|t[_ ]?(s|ms|us|ns|min|h|d|sec|msec)", name.strip()):
+        return NAMED
+    if any(w in _TIMES for w in words) or re.match(r"(?i)(date|time|zeit|datum|timestamp)", "".join(words)):
+        return NAMED
+    if "#" in name or any(w in _COUNTERS for w in words[:1]):
+        return COUNTED
+    return 0
+
+
+def is_generic(name: str) -> bool:
+    """Return whether a first column's name says that it is what the others are drawn over."""
+    return bool(
+        re.fullmatch(r"(?i)|column_1|unnamed: 0|x([ _-]?(value|axis|data|wert|achse))?", name.strip())
+    )
+
+
+def unit_of_time(name: str, unit: str | None) -> str | None:
+    """Return the unit of time that a header states, in brackets or as a word of the name."""
+    if unit is not None:
+        short = spelled(re.sub(r"\s+", " ", unit))
+        return short if short in SECONDS else None
+    words = tokens(name)
+    for word in reversed(words):
+        short = spelled(word)
+        if (
+            short in SECONDS
+            and (len(word) > 1 or (len(words) > 1 and word == words[-1]))
+            and word not in ("tag", "day")
+        ):
+            return short
+    return None
+
+
+def _run(t: np.ndarray) -> tuple[int, str]:
+    """Return points for how a clock runs, and the words for it."""
+    t = t[np.isfinite(t)]
+    steps = np.diff(t)
+    if not len(steps):
+        return 0, "one row"
+    if (steps < 0).all():
+        return TIES, "decreases"
+    back = np.mean(steps < 0)
+    if back > 0.02 and np.sum(steps < 0) > 1 or not (steps > 0).any():  # noqa: PLR2004
+        return FOREIGN, "does not increase"
+    if not (steps > 0).all():
+        return TIES, "increases, with equal or earlier times"
+    even = np.median(np.abs(steps - np.median(steps))) <= 0.02 * np.median(steps)  # noqa: PLR2004
+    return STRICT + (EVEN if even else 0), "increases evenly" if even else "increases"
+
+
+def read(name: str, cells: Cells, unit: str | None) -> Seconds:
+    """Return a column as seconds. Raises ClockError for one that cannot be a time."""
+    if isinstance(cells, np.ndarray):
+        if cells.dtype.kind in "mM":
+            return clock.from_stamps(cells)
+        there = np.isfinite(cells)
+        if not there.any():
+            raise ClockError(0, "the time is missing; a finite number or a date was expected")
+        if unit is None and (digits := _digits(cells[there])) is not None:
+            found = clock.from_texts(pa.array(digits))
+            t = np.full(len(cells), np.nan)
+            t[there] = found.t
+            return replace(found, t=t)
+        return clock.from_numbers(cells, unit_of_time(name, unit), named(name) > 0)
+    if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
+        return _exact(cells)
+    return clock.from_texts(cells)
+
+
+def _exact(cells: pa.Array) -> Seconds:
+    """Return long whole numbers, which floats would round, as seconds."""
+    compact = clock.tidied(cells)
+    if pc.all(pc.match_substring(compact, ":")).as_py():
+        return clock.from_texts(cells)
+    whole = pc.utf8_trim_whitespace(cells).cast(pa.int64()).to_numpy(zero_copy_only=False)
+    about = clock.from_numbers(whole.astype(float), None)
+    scale = next((e[1] for e in clock.EPOCHS if e[3] <= whole.min() and whole.max() <= e[4]), None)
+    return about if scale is None else replace(about, t=(whole - whole[0]) * scale)
+
+
+def _digits(values: np.ndarray) -> list[str] | None:
+    """Return numbers such as 20260301105957 as texts, if all of them are compact dates."""
+    if values.min() < 19_000_101 or np.any(values != np.round(values)):  # noqa: PLR2004
+        return None
+    low, high = values.min(), values.max()
+    for size in (1, 10_000, 1_000_000):
+        if 19_000_101 * size <= low and high < 21_000_101 * size:
+            texts = [str(int(v)) for v in values.tolist()]
+            return (
+                texts
+                if clock.are_times(pc.binary_join_element_wise(pa.array(texts), "", " ")) or _valid(texts)
+                else None
+            )
+    return None
+
+
+def _valid(texts: list[str]) -> bool:
+    try:
+        clock.from_texts(pa.array(texts))
+    except ClockError:
+        return False
+    return True
+
+
+def candidates(sheet: Sheet, refused: list[ClockError]) -> Iterator[Clock]:
+    """Yield every column, and every pair of a date and a time of day, that can be a clock.
+
+    `refused` collects what is wrong with columns of dates that are none."""
+    found: dict[str, Seconds] = {}
+    for name, cells in sheet.columns.items():
+        try:
+            filled = cells if isinstance(cells, np.ndarray) else pc.fill_null(cells, "")
+            found[name] = read(name, _complete(filled), sheet.units.get(name))
+        except ClockError as e:
+            if not isinstance(cells, np.ndarray) or named(name) > 0:
+                refused.append(ClockError(e.row, f"column '{name.strip()}': {e.reason}"))
+    for position, (name, seconds) in enumerate(found.items()):
+        yield _judged(sheet, (name,), seconds, position)
+    yield from _joined(sheet, found)
+    if sheet.step_s is not None:
+        t = sheet.offset_s + sheet.step_s * np.arange(len(sheet))
+        yield Clock(
+            (),
+            Seconds(t, sheet.start, f"{sheet.step_s:g} s a row, as the file states"),
+            STEP,
+            "stated interval",
+        )
+
+
+def _complete(cells: Cells) -> Cells:
+    """Leave out empty cells at the end: a shorter clock beside a longer one."""
+    if isinstance(cells, np.ndarray):
+        return cells
+    there = pc.not_equal(pc.utf8_trim_whitespace(cells), "").to_numpy(zero_copy_only=False)
+    return cells[: int(np.flatnonzero(there)[-1]) + 1 if there.any() else 0]
+
+
+def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: int) -> Clock:
+    name, unit, kind = columns[0], sheet.units.get(columns[0]), seconds.kind
+    by_name = max(named(c) for c in columns) if len(columns) > 1 else named(name)
+    running, runs = _run(seconds.t)
+    generic = position == 0 and is_generic(name) and len(sheet.columns) > 1
+    steps = np.diff(seconds.t[np.isfinite(seconds.t)])
+    counter = kind == "bare" and len(steps) > 0 and bool(np.all(steps == COUNTER))
+    counter = counter and (by_name == COUNTED or (generic and not name.strip().lower().startswith("x")))
+    points = KINDS[kind] + by_name + running + (FIRST if position == 0 else 0)
+    why = [kind]
+    if by_name:
+        why.append(
+            f"name '{name.strip()}'" if by_name > 0 else f"'{name.strip()}' names a counter or another time"
+        )
+    if kind == "bare" and unit is not None and known(unit):
+        points += FOREIGN
+        why.append(f"unit {unit}")
+    if kind == "bare" and by_name <= 0 and not generic:
+        points += COUNTED  # it only increases, as any signal may
+    if kind == "bare":
+        note = "its unit is assumed: s"
+        note = f"a counter, for want of times; {note} a step" if counter else note
+        seconds = replace(seconds, note="; ".join(filter(None, (seconds.note, note))))
+    if counter and points > FOREIGN:
+        points = NEEDED
+    return Clock(columns, seconds, points, f"{', '.join(why)}, {runs}", counter)
+
+
+def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
+    """Yield dates with a column of times of day, of either with a column of milliseconds."""
+    names = list(sheet.columns)
+    dates = [n for n, s in read.items() if s.kind == "date"]
+    full = [n for n, s in read.items() if s.kind in ("date and time", "time of day")]
+    pairs: list[tuple[tuple[str, ...], Seconds]] = [((n,), read[n]) for n in full]
+    for date in dates:
+        for of_day in names:
+            if (joined := _date_and_time(sheet, date, of_day, read)) is not None:
+                pairs.append(((date, of_day), joined))
+                yield _judged(sheet, (date, of_day), joined, names.index(date)).plus(JOINED)
+    for columns, seconds in pairs:
+        after = names.index(columns[-1]) + 1
+        if after < len(names) and (part := _fraction(sheet, names[after])) is not None:
+            t = seconds.t + part - part[0]
+            start = (
+                str(
+                    np.datetime64(seconds.start.rstrip("Z"), "ms")
+                    + np.timedelta64(round(part[0] * 1e3), "ms")
+                )
+                if seconds.start
+                else None
+            )
+            whole = replace(seconds, t=t, start=start, note=seconds.note + " and milliseconds")
+            yield _judged(sheet, (*columns, names[after]), whole, names.index(columns[0])).plus(2 * JOINED)
+
+
+def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds]) -> Seconds | None:
+    if of_day == date:
+        return None
+    days, hours = sheet.columns[date], sheet.columns[of_day]
+    if isinstance(hours, np.ndarray):
+        digits = hours[np.isfinite(hours)] if hours.dtype.kind == "f" else np.zeros(0)
+        plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
+        if not plain or digits.max() > 235_959 or named(of_day) <= 0:  # noqa: PLR2004
+            return None
+        long = digits.max() > 2359 or "hhmmss" in of_day.lower()  # noqa: PLR2004
+        hours = pa.array([f"{v:06.0f}" if long else f"{v:04.0f}00" for v in digits.tolist()])
+        hours = pc.replace_substring_regex(hours, r"^(\d\d)(\d\d)(\d\d)$", r"\1:\2:\3")
+    elif of_day not in read or read[of_day].kind != "time of day":
+        return None
+    if isinstance(days, np.ndarray):
+        if days.dtype.kind == "M":
+            days = pa.array(np.datetime_as_string(days, unit="D").tolist())
+        else:
+            days = pa.array([f"{v:.0f}" for v in days.tolist()])
+            days = pc.replace_substring_regex(days, r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3")
+    try:
+        return clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
+    except (ClockError, pa.ArrowInvalid):
+        return None
+
+
+def _fraction(sheet: Sheet, name: str) -> np.ndarray | None:
+    """Return the seconds of a column of milliseconds beside a time of whole seconds, None if it is none."""
+    values = sheet.columns[name]
+    if (
+        not isinstance(values, np.ndarray)
+        or values.dtype.kind != "f"
+        or not np.isfinite(values).all()
+        or not len(values)
+    ):
+        return None
+    named = unit_of_time(name, sheet.units.get(name)) == "ms" or re.search(r"(?i)\bm(illi)?s(ec)?", name)
+    inside = values.min() >= 0 and values.max() < MILLI and np.all(values == np.round(values))
+    return values / MILLI if named and inside else None
+
+
+def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
+    """Return the clock of a table with the columns that it times; several where they do not agree.
+
+    Two clocks are two tables in one file: `Time1, CH1, Time2, CH2`. Raises LookupError with the reason if
+    there is none. Raises ClockError for a wrong date that only a counter could replace."""
+    refused: list[ClockError] = []
+    ranked = sorted(candidates(sheet, refused), key=lambda c: -c.points)
+    good = [c for c in ranked if c.points >= NEEDED]
+    if refused and (not good or good[0].counter or good[0].points < SURE):
+        raise refused[0]
+    if not good:
+        raise LookupError("; ".join(f"'{'+'.join(c.columns)}' {c.why}" for c in ranked[:4]))
+    best = good[0]
+    others = _rivals(sheet, best, good[1:])
+    names = list(sheet.columns)
+    twins = {
+        c.columns[0]
+        for c in good
+        if len(c.columns) == 1
+        and "\0" in c.columns[0]
+        and np.array_equal(c.seconds.t, best.seconds.t, equal_nan=True)
+    }
+    names = [n for n in names if n not in twins]
+    if not others:
+        return [(best, [n for n in names if n not in best.columns])]
+    every = sorted((best, *others), key=lambda c: names.index(c.columns[0]))
+    begins = [names.index(c.columns[0]) for c in every] + [len(names)]
+    found = []
+    for k, c in enumerate(every):
+        mine = names[begins[k] : begins[k + 1]] + (names[: begins[0]] if k == 0 else [])
+        found.append((c, [n for n in mine if n not in c.columns]))
+    return found
+
+
+def _stem(name: str) -> str:
+    return re.sub(r"[\d_\s.]+", "", name).lower()
+
+
+def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:
+    """Return clocks of the same name, but for a number, that run otherwise and have columns of their own."""
+    names = list(sheet.columns)
+    taken = set(best.columns)
+    found: list[Clock] = []
+    for other in others:
+        (name, *more) = other.columns or ("",)
+        if more or not name or taken & {name} or other.counter:
+            continue
+        alike = _stem(name) == _stem(best.columns[0]) if best.columns else False
+        after = names.index(name) + 1
+        alone = after >= len(names) or any(names[after] in c.columns for c in (best, *found))
+        n = min(len(other.seconds.t), len(best.seconds.t))
+        same = np.array_equal(other.seconds.t[:n], best.seconds.t[:n], equal_nan=True)
+        if alike and other.seconds.kind == best.seconds.kind and not alone and not same:
+            found.append(other)
+            taken.add(name)
+    return found

@@ -1,0 +1,322 @@
+"""Texts that are no plain table: long tables, JSON, InfluxDB, Klipper's log, Tektronix.
+
+Each reader returns sheets of texts, or None where the text is of another kind.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from thermoctl.recording import clock
+from thermoctl.recording.dialect import cells_of
+from thermoctl.recording.sheet import Sheet
+from thermoctl.recording.units import WORDS, spelled
+from thermoctl.yamlfile import InputError
+
+IDS = WORDS["identities"].split()
+VALUES = WORDS["values"].split()
+_BOOKKEEPING = {"result", "table", "_start", "_stop", "_measurement"}
+_POINT = re.compile(
+    r"^(?P<head>(?:\\.|[^\s\\])+) (?P<fields>(?:\\.|\"(?:\\.|[^\"\\])*\"|[^\s\\\"])+)(?: (?P<time>-?\d+))?$"
+)
+_STATS = re.compile(r"^(?:[^\n]*?[ \t])?Stats (\d+\.\d+): (.*)$", re.MULTILINE)
+LEAD = 65536  # bytes that decide
+_GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
+
+
+def special(path: Path, text: bytes) -> list[Sheet] | None:
+    """Return the sheets of a text that is no table of rows; None for a table. Raises InputError."""
+    lead = text[:LEAD].decode("utf-8", errors="ignore")
+    for looks, reader in _LAYOUTS:
+        if looks.search(lead) and (found := reader(path, text.decode("utf-8"))) is not None:
+            return found
+    return None
+
+
+def _sheet(
+    path: Path, columns: Mapping[str, Sequence[Any]], place: Callable[[int], str], name: str = ""
+) -> Sheet:
+    texts = {n: pa.array(["" if v is None else _word(v) for v in c], pa.string()) for n, c in columns.items()}
+    return Sheet(dict(texts), place, name=name)
+
+
+def _word(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
+    names = list(dict.fromkeys(k for r in records for k, v in r.items() if not isinstance(v, dict | list)))
+    columns = {n: [r.get(n) for r in records] for n in names}
+    return _sheet(path, columns, lambda row: f"{path}: record {row + 1}")
+
+
+def _json(path: Path, text: str) -> list[Sheet] | None:
+    try:
+        content = json.loads(text)
+    except ValueError as e:
+        try:
+            content = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except ValueError:
+            if path.suffix.lower() == ".json":
+                raise InputError(f"{path}: no JSON: {e}") from None
+            return None
+    return _of_json(path, content)
+
+
+def _of_json(path: Path, content: Any) -> list[Sheet] | None:
+    """Return the tables of a JSON value: records, columns, or lists of either."""
+    if isinstance(content, list):
+        return _of_list(path, content)
+    if not isinstance(content, dict):
+        return None
+    for reader in (_thingspeak, _series, _temperature_store):
+        if found := reader(path, content):
+            return found
+    vectors = {
+        k: v for k, v in content.items() if isinstance(v, list) and v and not isinstance(v[0], dict | list)
+    }
+    if len(vectors) > 1 and len({len(v) for v in vectors.values()}) == 1:
+        return [_sheet(path, vectors, lambda row: f"{path}: item {row + 1}")]
+    inner = [f for v in content.values() if isinstance(v, dict | list) and (f := _of_json(path, v))]
+    if not inner:
+        inner = [f for v in content.values() if isinstance(v, list) for x in v if (f := _of_json(path, x))]
+    return [s for f in inner for s in f] or None
+
+
+def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
+    if content and all(isinstance(x, dict) for x in content):
+        found = [s for x in content for s in _series(path, x) or ()]
+        return found or [_records(path, content)]
+    lists = all(isinstance(x, list) and x and all(isinstance(y, dict) for y in x) for x in content)
+    if content and lists:  # Home Assistant: a list for each entity
+        return [_records(path, [{**_identity(x[0]), **y} for x in content for y in x])]
+    return None
+
+
+def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    feeds, titles = content.get("feeds"), content.get("channel", {})
+    if not isinstance(feeds, list) or not feeds or not isinstance(titles, dict):
+        return None
+    return [
+        _records(
+            path,
+            [{str(titles.get(k, k)) if k.startswith("field") else k: v for k, v in f.items()} for f in feeds],
+        )
+    ]
+
+
+def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    """Read a series of InfluxDB 1 (columns, values) or of Prometheus (metric, values)."""
+    if not isinstance(values := content.get("values"), list):
+        return None
+    if isinstance(content.get("columns"), list):
+        return [_records(path, [dict(zip(content["columns"], v, strict=False)) for v in values])]
+    if isinstance(content.get("metric"), dict):
+        labels = content["metric"]
+        name = "_".join(str(v) for k, v in labels.items() if k not in ("job",)) or "value"
+        return [_records(path, [{"time": v[0], name: v[1]} for v in values])]
+    return None
+
+
+def _identity(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in record.items() if k in IDS}
+
+
+def _temperature_store(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    """Read Moonraker's temperature store: a list a second for each heater and sensor, the newest last."""
+    columns: dict[str, list[Any]] = {}
+    for name, held in content.items():
+        if isinstance(held, dict) and isinstance(held.get("temperatures"), list):
+            for key, unit in (("temperatures", "temperature"), ("targets", "target"), ("powers", "power")):
+                if isinstance(held.get(key), list):
+                    columns[f"{name}_{unit}"] = held[key]
+    if not columns:
+        return None
+    rows = min(len(c) for c in columns.values())
+    sheet = _sheet(
+        path, {n: c[len(c) - rows :] for n, c in columns.items()}, lambda row: f"{path}: item {row + 1}"
+    )
+    sheet.units = {n: "degC" for n in columns if not n.endswith("_power")}
+    sheet.step_s = 1.0
+    return [sheet]
+
+
+def _annotated(path: Path, text: str) -> list[Sheet] | None:
+    """Read InfluxDB's annotated CSV: tables of records, each with a header of its own."""
+    records, places, header = [], [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        cells = cells_of(line, ",")
+        if "result" in cells and "table" in cells:
+            header = cells
+        elif len(cells) != len(header):
+            raise InputError(
+                f"{path}:{number}: {len(cells)} cells; {len(header)} as in the header were expected"
+            )
+        else:
+            places.append(number)
+            records.append({h: c for h, c in zip(header, cells, strict=True) if h and h not in _BOOKKEEPING})
+    if not records:
+        raise InputError(f"{path}: no rows; at least one record was expected")
+    sheet = _records(path, records)
+    sheet.place = lambda row: f"{path}:{places[min(row, len(places) - 1)]}"
+    return [sheet]
+
+
+def _points(path: Path, text: str) -> list[Sheet] | None:
+    """Read InfluxDB's line protocol: `measurement,tag=a field=1.0,other=2i 1772359200000000000`."""
+    rows = [(n, x) for n, x in enumerate(text.splitlines(), 1) if x.strip() and not x.startswith("#")]
+    if not rows or not (match := _POINT.match(rows[0][1])) or "=" not in match["fields"] or not match["time"]:
+        return None
+    found: dict[str, dict[str, list[Any]]] = {}
+    places: dict[str, list[int]] = {}
+    series: set[str] = set()
+    parsed = []
+    for number, line in rows:
+        match = _POINT.match(line.strip())
+        fields = re.findall(r'((?:\\.|[^,=\\])+)=("(?:\\.|[^"\\])*"|[^,]*)', match["fields"]) if match else []
+        if not match or not fields or match["time"] is None:
+            raise InputError(f"{path}:{number}: '{line[:40]}': a point `name field=value time` was expected")
+        parsed.append((number, match["head"], fields, match["time"]))
+        series.add(match["head"])
+    for number, head, fields, time in parsed:
+        table = found.setdefault(head, {"time": []})
+        places.setdefault(head, []).append(number)
+        count = len(table["time"])
+        table["time"].append(time)
+        for key, value in fields:
+            value = value[:-1] if re.fullmatch(r"-?\d+[iu]", value) else value.strip('"')
+            table.setdefault(key.replace("\\", ""), [None] * count).append(value)
+        for column in table.values():
+            column.extend([None] * (count + 1 - len(column)))
+    sheets = []
+    for head, table in found.items():
+        tags = "_".join(part.partition("=")[2] for part in head.split(",")[1:]) or head
+        named = {k if k == "time" or len(series) == 1 else f"{tags}_{k}": v for k, v in table.items()}
+        numbers = places[head]
+        sheets.append(_sheet(path, named, lambda row, numbers=numbers: f"{path}:{numbers[row]}"))  # type: ignore[misc]
+    return sheets
+
+
+def _klipper(path: Path, text: str) -> list[Sheet] | None:
+    """Read the lines `Stats 123.4: heater_bed: target=60 temp=59.9 pwm=0.4 ...` of Klipper's log."""
+    found = list(_STATS.finditer(text))
+    if len(found) < 2:  # noqa: PLR2004
+        return None
+    records = []
+    for match in found:
+        record: dict[str, Any] = {"time [s]": match[1]}
+        section = ""
+        for word in match[2].split():
+            key, sign, value = word.partition("=")
+            if not sign and word.endswith(":"):
+                section = word[:-1]
+            elif sign and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", value):
+                record[key if key in _GLOBAL or not section else f"{section}_{key}"] = value
+        records.append(record)
+    sheet = _records(path, records)
+    sheet.units = {n: "degC" for n in sheet.columns if n.endswith(("_temp", "_target"))} | {"time [s]": "s"}
+    sheet.place = lambda row: f"{path}:{text.count(chr(10), 0, found[row].start()) + 1}"
+    return [sheet]
+
+
+def _tektronix(path: Path, text: str) -> list[Sheet] | None:
+    """Read the table of a Tektronix TDS: key, value, empty, time, value in each line."""
+    rows = [cells_of(x, ",") for x in text.splitlines() if x.strip()]
+    if any(len(r) < 5 for r in rows):  # noqa: PLR2004
+        return None
+    facts = {r[0].lower(): r[1] for r in rows if r[0]}
+    name = facts.get("source", "CH1") or "CH1"
+    sheet = _sheet(
+        path, {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
+    )
+    units = {"TIME": spelled(facts.get("horizontal units", "s")), name: spelled(facts.get("vertical units"))}
+    sheet.units = {k: v for k, v in units.items() if v}
+    return [sheet]
+
+
+_LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]], ...] = (
+    (re.compile(r"\A\s*[{\[]"), _json),
+    (re.compile(r"\A(?:#(?:datatype|group|default)\b|,result,table\b)"), _annotated),
+    (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
+    (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
+    (re.compile(r"\A\"?Record Length\"?,"), _tektronix),
+)
+
+
+def pivoted(sheet: Sheet) -> list[Sheet] | None:
+    """Return a sheet for each signal of a long table (signal, time, value); None for a wide one."""
+    lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
+    identity = next((lower[k] for k in IDS if k in lower), None)
+    value = next((lower[k] for k in VALUES if k in lower), None)
+    if (
+        identity is None
+        or value is None
+        or identity == value
+        or isinstance(sheet.columns[identity], np.ndarray)
+    ):
+        return None
+    ids = pc.fill_null(sheet.columns[identity], "")
+    rest = {n: c for n, c in sheet.columns.items() if n not in (identity, value)}
+    times = {n: c for n, c in rest.items() if _is_clock(c)}
+    tags = [
+        n
+        for n, c in rest.items()
+        if n not in times and not isinstance(c, np.ndarray) and len(pc.unique(c)) > 1
+    ]
+    if not times:
+        return None
+    if tags and identity.startswith("_"):
+        ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
+    found = []
+    for name in pc.unique(ids).to_pylist():
+        if not name or name.startswith("$"):  # WinCC marks the start and the end of its run by $RT_OFF$
+            continue
+        rows = np.flatnonzero(pc.equal(ids, name).to_numpy(zero_copy_only=False))
+        place = _places(sheet.place, rows)
+        columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value]}.items()}
+        found.append(
+            Sheet(
+                columns,
+                place,
+                {name: u} if (u := _unit(rest, rows)) else {},
+                name=name,
+                decimal=sheet.decimal,
+            )
+        )
+    return found or None
+
+
+def _places(place: Callable[[int], str], rows: np.ndarray) -> Callable[[int], str]:
+    return lambda row: place(int(rows[row]))
+
+
+def _taken(cells: Any, rows: np.ndarray) -> Any:
+    return cells[rows] if isinstance(cells, np.ndarray) else cells.take(pa.array(rows))
+
+
+def _unit(rest: Mapping[str, Any], rows: np.ndarray) -> str | None:
+    for name, cells in rest.items():
+        if name.lower() in ("unit", "unit_of_measurement", "einheit", "units") and not isinstance(
+            cells, np.ndarray
+        ):
+            return spelled(cells[int(rows[0])].as_py())
+    return None
+
+
+def _is_clock(cells: Any) -> bool:
+    if isinstance(cells, np.ndarray):
+        there = cells[np.isfinite(cells)] if cells.dtype.kind == "f" else cells
+        return cells.dtype.kind in "mM" or (
+            len(there) > 0 and clock.from_numbers(there, None).kind == "epoch"
+        )
+    return len(cells) > 0 and clock.are_times(cells)

@@ -1,0 +1,44 @@
+"""Rows as a file holds them, before their clock is known: a table, an Excel sheet, a group of channels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+import pyarrow as pa
+
+from thermoctl.recording.clock import Seconds
+
+Cells: TypeAlias = np.ndarray | pa.Array
+"""A column: float64, datetime64 or timedelta64 values, or texts."""
+
+
+@dataclass
+class Sheet:
+    """Columns of one length, in the order of the file.
+
+    - `place`: names data row k (from 0)
+    - `units`: by column, where the file states them
+    - `step_s`, `offset_s`: the stated time between rows, and of the first row
+    - `start`: the date of time 0
+    - `decimal`: the decimal sign that the file shows
+    - `clock`: the times, where the format gives them
+    - `again`: reads the rows once more, cell by cell, if they make no table"""
+
+    columns: dict[str, Cells]
+    place: Callable[[int], str]
+    units: dict[str, str] = field(default_factory=dict)
+    name: str = ""
+    step_s: float | None = None
+    offset_s: float = 0.0
+    start: str | None = None
+    decimal: str | None = None
+    clock: Seconds | None = None
+    again: Callable[[], list[Sheet]] | None = None
+    meta: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))

@@ -1,0 +1,125 @@
+"""Units as loggers write them: symbols, words, brackets; and the scale between two of one kind."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+WORDS: dict[str, Any] = yaml.load(
+    Path(__file__).with_name("words.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+)
+"""Words that loggers use, by kind."""
+# Symbols that make `(...)` behind a name a unit; square brackets always hold one.
+_PREFIX = {
+    "": 1.0,
+    "p": 1e-12,
+    "n": 1e-9,
+    "u": 1e-6,
+    "µ": 1e-6,
+    "m": 1e-3,
+    "c": 1e-2,
+    "d": 1e-1,
+    "da": 1e1,
+    "h": 1e2,
+}
+_PREFIX |= {"k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
+_BASE: tuple[str, ...] = (
+    "m",
+    "g",
+    "s",
+    "A",
+    "K",
+    "V",
+    "W",
+    "J",
+    "N",
+    "Pa",
+    "Hz",
+    "ohm",
+    "F",
+    "H",
+    "C",
+    "T",
+    "Wh",
+    "l",
+    "L",
+    "mol",
+    "bar",
+)
+_BASE = (*_BASE, "VA", "var", "S", "Nm", "eV", "Wb", "lx", "rad", "Ah")
+_SYMBOL = (
+    r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|rpm|rps|kn|dBm|dB|"
+    r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|eV|Wb|lx|rad|Ah))"
+)
+_POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
+_UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
+_NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
+_SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Seconds of a unit of time."""
+
+
+def spelled(unit: str | None, name: str = "") -> str | None:
+    """Return a unit as pint writes it: °C is degC, Volts is V; None where nothing is stated.
+
+    C and F are degrees, but of a charge or a capacity."""
+    if unit in ("C", "F") and not re.search(r"(?i)charge|ladung|capa|kapa|^[qc]([_ 0-9]|$)", name):
+        return f"deg{unit}"
+    unit = re.sub(r"\s+", " ", (unit or "").strip()).replace("μ", "µ")
+    if unit.lower() in _SPELLED and unit not in ("Grad", "STD", "Std"):
+        return _SPELLED[unit.lower()]
+    unit = re.sub(r"°\s?C|℃|\bdeg\.? ?C\b", "degC", unit)
+    unit = re.sub(r"°\s?F|℉|\bdeg\.? ?F\b", "degF", unit)
+    unit = re.sub("Ω|Ω|Ohm", "ohm", unit)
+    return unit if unit not in ("", "-", "–", "--") else None
+
+
+def known(unit: str) -> bool:
+    """Return whether a text is a unit by its symbols or words."""
+    written = spelled(unit)
+    return written is not None and bool(_UNIT.match(written))
+
+
+def split_unit(header: str) -> tuple[str, str | None]:
+    """Return name and unit of `T_block [degC]`, `T_block (degC)`, `T_block / °C`; None for no unit."""
+    text = header.strip()
+    match = _NAMED.match(text)
+    if not match:
+        return text, None
+    name, square, bracket, slash = match.groups()
+    unit = (square if square is not None else bracket if bracket is not None else slash).strip()
+    if square is None and not known(unit):
+        return text, None
+    return name.strip(), spelled(unit, name)
+
+
+def split_words(header: str) -> tuple[str, str | None]:
+    """Return name and unit of a header that also may be `Temp, °C (LGR S/N: 7)` or `Spannung in V`."""
+    text = re.sub(r"\s*\((?:LGR|SEN|LBL)[^)]*\)", "", header.strip())
+    name, unit = split_unit(text)
+    if (
+        unit is None
+        and (match := re.match(r"(.*?\S)(?:\s*,\s*|\s+in\s+)(\S+(?: [CF])?)$", text))
+        and known(match[2])
+    ):
+        return match[1], spelled(match[2], match[1])
+    return name, unit
+
+
+def scale_between(unit: str | None, other: str | None) -> float | None:
+    """Return the factor from one unit to another of the same base; None if there is none."""
+    if unit == other:
+        return 1.0
+    if unit in SECONDS and other in SECONDS:
+        return SECONDS[unit] / SECONDS[other]
+    a, b = _parts(unit), _parts(other)
+    return _PREFIX[a[0]] / _PREFIX[b[0]] if a and b and a[1] == b[1] else None
+
+
+def _parts(unit: str | None) -> tuple[str, str] | None:
+    """Return SI prefix and base of a unit; None for another."""
+    found = sorted((p, b) for b in _BASE for p in _PREFIX if p + b == unit)
+    return found[0] if found else None
