@@ -63,7 +63,6 @@ class Judged:
     rare: Mapping[frozenset[Key], int]
     energy: Mapping[frozenset[Key], Energy]
     dims: Mapping[Key, int]
-    laws: Mapping[tuple[frozenset[Key], Key], tuple[float, int]]
     truths: tuple[frozenset[Key], ...]
     tolerated: frozenset[Key] = frozenset()
 
@@ -76,15 +75,10 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
     keyed = {frozenset(_key(e) for e in h["effects"]): h for h in found}
 
     dims = {k: n for h in found for k, n in zip(map(_key, sorted(h["effects"])), h["dims"], strict=True)}
-    counts = {keys: sum(rare(entries[e], where in inputs) for e, where in keys) for keys in keyed}
+    counts = {
+        keys: sum(rare(entries[e], where in inputs) for e, where in keys if e in entries) for keys in keyed
+    }
     missing = np.log(used.missing / (1 - used.missing))
-    laws = {}
-    for keys, h in keyed.items():
-        for at, more in h["with_unknown_law"].items():
-            if more is None:  # it could not be refitted
-                continue
-            classes = 1 + rare(entries[_key(at)[0]], _key(at)[1] in inputs)
-            laws[keys, _key(at)] = more - missing - classes * np.log(used.rare), classes
     return Judged(
         result.name,
         {keys: h["log_evidence"] for keys, h in keyed.items()},
@@ -95,7 +89,6 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
         counts,
         {keys: Energy(*(tuple(h[n]) for n in ("energy", "misfit", "rows"))) for keys, h in keyed.items()},
         dims,
-        laws,
         (),
     )
 
@@ -143,12 +136,7 @@ def posterior(case: Judged, numbers: Limits) -> Posterior:
         + case.rare[keys] * np.log(numbers.rare)
         for keys in physics
     }
-    laws = {
-        (keys, at): scores[keys] + more + own + classes * np.log(numbers.rare)
-        for (keys, at), (more, classes) in case.laws.items()
-        if keys in scores
-    }
-    return weigh(scores, physics, numbers, laws)
+    return weigh(scores, physics, numbers)
 
 
 def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:

@@ -21,11 +21,11 @@ def weighed(scores):
 def test_a_small_remainder_that_is_certain_is_not_nothing():
     found = weighed({NOTHING: 0.0, ONE: -9.0})
     assert (
-        decide(found, Facts(found.something, found.known, (), 1.04, 1.0, 0.99), limits()).verdict
+        decide(found, Facts(found.something, found.something, (), 1.04, 1.0, 0.99), limits()).verdict
         == "unexplained"
     )
     found = weighed({NOTHING: 0.0, ONE: 40.0})
-    beside = decide(found, Facts(found.something, found.known, (A,), 1.04, 0.3, 0.99), limits())
+    beside = decide(found, Facts(found.something, found.something, (A,), 1.04, 0.3, 0.99), limits())
     assert (beside.verdict, beside.named) == ("partly_explained", (A,))
 
 
@@ -43,28 +43,22 @@ def test_a_small_remainder_that_is_certain_is_not_nothing():
 def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
     posterior = weighed(scores)
     found = decide(
-        posterior, Facts(posterior.something, posterior.known, named, over_noise, 1.0, 0.0, worse), limits()
+        posterior,
+        Facts(posterior.something, posterior.something, named, over_noise, 1.0, 0.0, worse),
+        limits(),
     )
     assert found.verdict == verdict
     assert (found.named == named) == (verdict in ("explained", "partly_explained") or not named)
 
 
-@pytest.mark.parametrize(
-    ("law", "verdict"), [(30.0, "explained"), (39.0, "ambiguous"), (42.0, "unexplained")]
-)
-def test_an_unknown_law_in_the_place_of_an_effect_is_something_too(law, verdict):
-    """Though nothing else is likely, it is never nothing; as likely as the effect, it takes the name."""
-    scores = {NOTHING: 0.0, ONE: 40.0}
-    found = weigh(scores, {NOTHING: {}, ONE: {A: 1.0}}, limits(), {(NOTHING, A): law})
-    assert found.something > 0.99
-    assert found.known == pytest.approx(found.effects[A])
-    named = (A,) if found.effects[A] >= limits().name else ()
-    assert decide(found, Facts(found.something, found.known, named, 1.0, 1.0), limits()).verdict == verdict
+def test_what_nothing_else_confirms_is_missing_and_has_no_name():
+    found = weighed({NOTHING: 0.0, ONE: 40.0})
+    assert decide(found, Facts(found.something, 0.0, (), 3.0, 1.0), limits()).verdict == "unexplained"
 
 
 def test_alternatives_hold_the_set_and_no_more():
     found = weighed({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5, frozenset({("back_emf", "v")}): 10.0})
-    facts = Facts(found.something, found.known, (), 1.0, 0.3)
+    facts = Facts(found.something, found.something, (), 1.0, 0.3)
     assert [k for k, _ in decide(found, facts, limits()).alternatives] == [A, B]
 
 

@@ -13,7 +13,7 @@ def law(n, sd, form="power"):
         "expression": "A1 * velocity**n1",
         "into": "velocity",
         "share_closed": 0.74,
-        "terms": [{"form": form, "variables": ["velocity"], "sizes": {"A": "A1"}, "shapes": {"n": "n1"}}],
+        "forms": [{"form": form, "variables": ["velocity"], "sizes": {"A": "A1"}, "shapes": {"n": "n1"}}],
         "parameters": {
             "A1": {"value": -2.0, "sd": 0.1, "unit": "N"},
             "n1": {"value": n, "sd": sd, "unit": None},

@@ -19,11 +19,9 @@ from typing import Any
 import numpy as np
 
 from tests.laws.rigs import LAWS, RATIOS, RELAYS, STORAGES, Made, Truth, drawn, make
-from thermoctl.diagnose.case import Budget, case
 from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law.find import Law, find_law
+from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.refit import law_rate
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import expression as ex
@@ -69,17 +67,11 @@ def cases() -> list[tuple[str, Truth | None, str, str, str, int]]:
 def judge(made: Made, full: bool) -> dict[str, Any]:
     """Look for the law of one case, and compare with its truth."""
     started = time.process_time()
-    numbers, law = limits(), None
-    if full:
-        d = diagnose(made.plant, made.tables[:3], catalogue(), numbers)
-        law, plant, null = d.law, d.extended, d.null.plant
-        named = [f"{e.key[0]} at {e.key[1]}" for e in d.shown]
-        verdict = d.decision.verdict
-    else:
-        known = case(made.plant, made.tables[:2], {}, Budget(numbers.fits))
-        first = fitted(known, known.plant, (), known.null)
-        law, named, verdict = find_law(known, first, numbers, made.tables[2:3]), [], ""
-        plant, null = (law.fitted.plant if law else first.plant), first.plant
+    numbers = limits()
+    d = diagnose(made.plant, made.tables[:3], catalogue() if full else {}, numbers)
+    law, plant, null = d.law, d.extended, d.null.plant
+    named = [f"{e.key[0]} at {e.key[1]}" for e in d.shown]
+    verdict = d.decision.verdict
     out: dict[str, Any] = {
         "seconds": round(time.process_time() - started, 1),
         "verdict": verdict,

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.proof.rigs import RIGS, Rig
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.law.find import Law, find_law
+from thermoctl.diagnose.diagnosis import diagnose
 from thermoctl.diagnose.law.result import law_entry
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.report.words import law_sentence
+from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 
@@ -28,16 +27,14 @@ PUBLISHED = {
 }
 
 
-def law_of(folder: Path, rig: Rig) -> tuple[dict[str, float], Law | None]:
-    """The rms error of a refit of the naive plant, and the law of what it leaves."""
+def law_of(folder: Path, rig: Rig) -> Diagnosis:
+    """Return the diagnosis without the catalogue."""
     numbers, plant = limits(), load(folder / rig.folder / rig.plant)
 
     def read(names: str):
         return read_recordings(plant, [folder / rig.folder / f"{n}.csv" for n in names.split()])
 
-    known = case(plant, read(rig.runs), {}, Budget(numbers.fits))
-    first = fitted(known, plant, (), known.null)
-    return first.fit.rms(), find_law(known, first, numbers, read(rig.held_out))
+    return diagnose(plant, read(rig.runs), {}, numbers, read(rig.held_out))
 
 
 def main(folder: Path, names: Sequence[str]) -> None:
@@ -46,16 +43,17 @@ def main(folder: Path, names: Sequence[str]) -> None:
         if not (folder / rig.folder / rig.plant).is_file() or (names and rig.name not in names):
             continue
         started = time.process_time()
-        rms, law = law_of(folder, rig)
+        d = law_of(folder, rig)
+        law = d.law
         print(f"## {rig.name}")
         if rig.name in PUBLISHED:
             print(f"published: {PUBLISHED[rig.name]}")
         if law:
-            entry = law_entry(law)
+            entry = law_entry(law, d.worth)
             assert entry is not None
             print(f"found: {law_sentence(entry)}")
-            print(f"rms: {rms} -> {entry['rms']}; energy closed on {law.worth.names}: {law.closed:.2f}")
-            print("\n".join(entry["family"]))
+            print(f"rms: {d.null.fit.rms()} -> {entry['rms']}; energy closed: {d.worth.share_closed:.2f}")
+            print("\n".join(entry["equivalent"]))
         else:
             print("found: no law")
         print(f"{time.process_time() - started:.0f} s\n", flush=True)

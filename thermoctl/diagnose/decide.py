@@ -5,7 +5,7 @@ The first row of a table whose condition holds decides."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
@@ -13,32 +13,28 @@ from scipy.special import logsumexp
 from thermoctl.diagnose.limits import Limits
 
 Key = tuple[str, str]  # (effect, where)
-Laws = dict[tuple[frozenset[Key], Key], float]  # scores, by effects and the one in whose place a law is
 
 
 @dataclass(frozen=True)
 class Posterior:
     """Probability of each hypothesis tried (by its effects), and of each effect.
 
-    `known`: that some effect is there; `something`: that some effect or an unknown law is. `laws`: that a law
-    is there, by the effect in whose place it is"""
+    `something`: that some effect or law is there"""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
-    known: float
     something: float
-    laws: Mapping[Key, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Facts:
     """All numbers that a verdict depends on.
 
-    - `something`: probability that some effect or an unknown law is there; `known`: that some effect is
+    - `something`: probability that some effect or law is there; `known`: the same, 0 if nothing confirms one
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
-    - `flow`: probability that a flow is missing which no output shows alone, or that an unknown law is there
+    - `flow`: probability that a flow is missing which no output shows alone
     - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
 
     something: float
@@ -66,35 +62,23 @@ def weigh(
     scores: Mapping[frozenset[Key], float],
     physics: Mapping[frozenset[Key], Mapping[Key, float]],
     limits: Limits,
-    laws: Laws | None = None,
 ) -> Posterior:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
     `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
     a value above 1 makes the probabilities less extreme. `physics`: probability that each effect of a
-    hypothesis is physics and no unnamed misfit. `laws`: scores of hypotheses with an unknown law beside them,
-    in the place of an effect (unknown_law.py)."""
-    laws = laws or {}
-    total = logsumexp(np.array([*scores.values(), *laws.values()]) / limits.temperature)
+    hypothesis is physics and no unnamed misfit."""
+    total = logsumexp(np.array([*scores.values()]) / limits.temperature)
     of = {keys: float(np.exp(score / limits.temperature - total)) for keys, score in scores.items()}
-    unknown: dict[Key, float] = {}
-    of_law: dict[frozenset[Key], float] = {}
-    for (keys, at), score in laws.items():
-        p = float(np.exp(score / limits.temperature - total))
-        of[keys] += p
-        unknown[at] = unknown.get(at, 0.0) + p
-        of_law[keys] = of_law.get(keys, 0.0) + p
     order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
     hypotheses = {keys: of[keys] for keys in order}
     effects: dict[Key, float] = {}
-    known = something = 0.0
+    something = 0.0
     for keys, q in hypotheses.items():
-        of_effects, unknown_too = max(physics[keys].values(), default=0.0), of_law.get(keys, 0.0)
-        known += q * of_effects
-        something += (q - unknown_too) * of_effects + unknown_too
+        something += q * max(physics[keys].values(), default=0.0)
         for key in keys:
             effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
-    return Posterior(hypotheses, effects, known, something, unknown)
+    return Posterior(hypotheses, effects, something)
 
 
 def _only_noise(f: Facts, limits: Limits) -> bool:
@@ -110,8 +94,8 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
     ),
     ("nothing is supported for sure and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
     (
-        "an unknown law is likelier than the effects of the catalogue",
-        lambda f, q: f.something - f.known > f.known,
+        "something is missing, and nothing else confirms an effect or law",
+        lambda f, q: f.known < q.name,
         "unexplained",
     ),
     (

@@ -7,25 +7,25 @@ from dataclasses import replace
 
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import Effect, contained
-from thermoctl.diagnose.decide import Facts, decide
-from thermoctl.diagnose.fit import as_refitted, with_residuals
+from thermoctl.diagnose.confirm import Confirm, confirmed
+from thermoctl.diagnose.decide import Decision, Facts, Key, Posterior, decide, weigh
+from thermoctl.diagnose.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnose.held_out import split, worth
-from thermoctl.diagnose.law.find import find_law
+from thermoctl.diagnose.law.contest import with_laws
+from thermoctl.diagnose.law.find import Law, found_law
+from thermoctl.diagnose.law.forms import LAW
 from thermoctl.diagnose.law.smooth import missing_flow
 from thermoctl.diagnose.levels import remainder
 from thermoctl.diagnose.limits import Limits
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.misfit import energies, standing, supported
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.search import Searched, search
+from thermoctl.diagnose.search import Keys, Searched, Weighed, search
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.diagnose.unknown import left, reached
-from thermoctl.diagnose.unknown_flow import flow_missing
-from thermoctl.diagnose.unknown_law import missing_law, weigh_laws
+from thermoctl.diagnose.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
-
-WITHOUT_REMAINDER = ("consistent", "explained")  # verdicts that leave nothing for a law
 
 
 @one_thread()
@@ -48,17 +48,11 @@ def diagnose(
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
-    searched = search(known, numbers)
+    searched = with_laws(known, search(known, numbers), numbers, say)
     say("measuring what the findings are worth")
     found = _decided(known, searched, numbers, reserve, stopped() and bool(known.budget.untried))
     if found.decision.verdict != "consistent" and not found.shown and found.before.node:
         found = replace(found, missing_flow=missing_flow(known, found.null, found.before.node))
-    if (
-        found.decision.verdict not in WITHOUT_REMAINDER
-        and not stopped()
-        and max(found.remainder.over_noise.values()) > numbers.clean
-    ):
-        found = replace(found, law=find_law(known, found.final, numbers, reserve, say))
     return found
 
 
@@ -73,12 +67,15 @@ def _decided(
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     fits = {keys: w.fitted for keys, w in tried.items()}
-    posterior, laws, signals = weigh_laws(known, tried, physics, numbers)
+    posterior = weigh({keys: tried[keys].score for keys in physics}, physics, numbers)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
-    if posterior.something >= numbers.name and 2 * posterior.known >= posterior.something:
+    asked: dict[Key, float] = {}
+    if posterior.something >= numbers.name:
         likeliest = next(keys for keys in posterior.hypotheses if keys)
         stand = supported(likeliest, physics)  # the other effects are part of the remainder
-        best = with_residuals(known, fits.get(stand, fits[likeliest]))
+        found = stand if stand in fits else likeliest
+        kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
+        best = with_residuals(known, fits[kept]) if kept else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
@@ -88,16 +85,15 @@ def _decided(
     told = bool(best.hypothesis.effects) and value.reserved
     ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
-    unknown = missing_law(posterior, searched.tried, signals)
-    if remains < numbers.name and unknown.probability < numbers.name:
-        flow = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
-        unknown = max(unknown, flow, key=lambda missing: missing.probability)
+    unknown = Missing()
+    if remains < numbers.name:
+        unknown = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
     if unknown.probability >= numbers.name:
         after = replace(after, node=unknown.node or after.node)
         before = before if best.hypothesis.effects else after
     facts = Facts(
         posterior.something,
-        posterior.known,
+        posterior.something if best.hypothesis.effects or not asked else 0.0,
         named,
         max(after.over_noise.values()),
         ratio,
@@ -108,8 +104,39 @@ def _decided(
     decision = decide(posterior, facts, numbers)
     doubt = unknown.told(decision.verdict, numbers)
     return Diagnosis(
-        known, searched, posterior, best, null, after, before, value, decision, energy, physics, doubt, laws
+        known,
+        searched,
+        posterior,
+        best,
+        null,
+        after,
+        before,
+        value,
+        decision,
+        energy,
+        physics,
+        doubt,
+        asked,
+        law=_law(known, tried, best, decision, posterior, asked),
     )
+
+
+def _law(
+    known: Case,
+    tried: Mapping[Keys, Weighed],
+    best: Fitted,
+    decision: Decision,
+    posterior: Posterior,
+    asked: Mapping[Key, float],
+) -> Law | None:
+    """Return the law among the names, with its gain over the best hypothesis without it."""
+    key = next((key for key in decision.named if key[0] == LAW), None)
+    if key is None:
+        return None
+    mine = best.hypothesis.keys
+    without = max((w for keys, w in tried.items() if keys < mine and key not in keys), key=lambda w: w.score)
+    gain = tried[mine].score - without.score
+    return found_law(known, best, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

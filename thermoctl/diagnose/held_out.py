@@ -25,7 +25,8 @@ BLOCKS = 16  # of a recording. Where recordings are too few, every other one is 
 class Worth:
     """Root-mean-square errors per output of the original plant, refitted, and with the findings.
 
-    `reserved`: on recordings set aside; otherwise cross-validated, on data that took part in the choice.
+    `noise`: standard deviation of each output's noise. `reserved`: on recordings set aside; otherwise
+    cross-validated, on data that took part in the choice.
     `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
     without such recordings."""
 
@@ -34,17 +35,17 @@ class Worth:
     after: dict[str, float]
     reserved: bool
     names: tuple[str, ...]
+    noise: dict[str, float]
     worse: float = 0.0
 
     @property
     def share_closed(self) -> float | None:
-        """Share of the misfit's energy, relative to each output's, that the findings close."""
-        pairs = [
-            (self.refit_only[o], self.after[o])
-            for o in self.after
-            if self.refit_only.get(o, 0) > 0 and np.isfinite(self.after[o])
-        ]
-        return float(np.mean([1 - (b / a) ** 2 for a, b in pairs])) if pairs else None
+        """Share of the energy beyond the noise, summed over outputs, that the findings close."""
+        before, after = (
+            sum(max((rms.get(o, np.inf) / self.noise[o]) ** 2 - 1, 0.0) for o in self.refit_only)
+            for rms in (self.refit_only, self.after)
+        )
+        return float(1 - after / before) if before > 0 and np.isfinite(after) else None
 
 
 def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Table], list[Table]]:
@@ -60,19 +61,20 @@ def worth(
     """Errors on the reserve; without one, on every other block, the plants refitted to the rest.
 
     `known`: of another hypothesis, whose errors without the findings are the same."""
+    noise = {o: n.sigma for o, n in zip(case.plant.outputs, case.noise, strict=True)}
     if reserve:
         if case.block > 1:
             reserve = [means(compile_plant(null.plant), t, case.block) for t in reserve]
 
         names, model = tuple(t.name for t in reserve), null.fit.model
-        after = [_errors(case, best.plant, t) for t in reserve]
+        after = [errors_aside(case, best.plant, t) for t in reserve]
         if known:
             return dataclasses.replace(known, after=_rms(after, model))
-        came, alone = ([_errors(case, plant, t) for t in reserve] for plant in (case.plant, null.plant))
+        came, alone = ([errors_aside(case, plant, t) for t in reserve] for plant in (case.plant, null.plant))
         sizes = [_rms(errors, model) for errors in (came, alone, after)]
-        return Worth(sizes[0], sizes[1], sizes[2], True, names, worse(alone, after))
-    before = _rms([_errors(case, case.plant, t) for t in case.tables], null.fit.model)
-    return Worth(before, _crossed(case, null), _crossed(case, best), False, ())
+        return Worth(sizes[0], sizes[1], sizes[2], True, names, noise, worse(alone, after))
+    before = _rms([errors_aside(case, case.plant, t) for t in case.tables], null.fit.model)
+    return Worth(before, _crossed(case, null), _crossed(case, best), False, (), noise)
 
 
 def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
@@ -102,7 +104,7 @@ def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
     }
 
 
-def _errors(case: Case, plant: Plant, table: Table) -> np.ndarray:
+def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Free-run errors on a recording that took no part, less what its uncertain start explains."""
     model = compile_plant(plant)
     d = model.prepare(model.excitation(table))

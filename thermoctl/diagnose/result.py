@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.decide import Decision, Key, Laws, Posterior
+from thermoctl.diagnose.decide import Decision, Key, Posterior
 from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law.find import Law
+from thermoctl.diagnose.law.refit import PlacedLaw
 from thermoctl.diagnose.law.result import law_entry
 from thermoctl.diagnose.law.smooth import flow_unit
 from thermoctl.diagnose.levels import late
@@ -29,6 +30,7 @@ FOLLOWS = (
     0.3  # of an output's variance: most that a plant of the right rig leaves, even where it lacks physics
 )
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
+UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
 BLOCKS, LARGE = (
     40,
     1.5,
@@ -45,9 +47,9 @@ class Diagnosis:
     - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
       probability of being physics
     - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
-    - `laws`: scores of hypotheses with an unknown law in the place of an effect
+    - `asked`: probability that an effect predicts what it was not fitted to, of those that would be named
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit, where nothing is shown
-    - `law`: a law for the remainder of the outcome"""
+    - `law`: a law among the findings"""
 
     case: Case
     searched: Searched
@@ -61,40 +63,48 @@ class Diagnosis:
     energy: Mapping[frozenset[Key], Energy]
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
     unknown: str
-    laws: Laws
+    asked: Mapping[Key, float]
     missing_flow: float | None = None
     law: Law | None = None
 
     @property
     def shown(self) -> tuple[Placed, ...]:
         """The effects that the result reports as findings."""
-        effects = self.best.hypothesis.effects
+        effects = [e for e in self.best.hypothesis.effects if not isinstance(e, PlacedLaw)]
         if self.decision.verdict == "ambiguous":
-            return effects
-        if self.decision.verdict in ("explained", "partly_explained"):
-            return tuple(e for e in effects if e.key in self.decision.named)
-        return ()
+            return tuple(effects)
+        return tuple(e for e in effects if e.key in self.decision.named)
+
+    @property
+    def refused(self) -> frozenset[Key]:
+        """Return the effects that would be named, and that nothing else confirms."""
+        return frozenset(self.asked) - {*self.decision.named}
+
+    @property
+    def extends(self) -> bool:
+        """Return whether the outcome is the plant with something that it lacked."""
+        return bool(self.shown) or self.law is not None
 
     @property
     def final(self) -> Fitted:
         """The hypothesis that the result shows as the outcome."""
-        return self.best if self.shown else self.null
+        return self.best if self.extends else self.null
 
     @property
     def remainder(self) -> Left:
         """The residual of the outcome."""
-        return self.left if self.shown else self.before
+        return self.left if self.extends else self.before
 
     @property
     def extended(self) -> Plant:
-        """The plant with the findings and the law of the remainder, refitted."""
-        return self.law.fitted.plant if self.law else self.final.plant
+        """The plant with the findings and the law, refitted."""
+        return self.final.plant
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
     """Return thermoctl-diagnosis/1; `next_experiment`, `not_seen` and `seconds` are still empty."""
     keys = {e.key for e in d.shown}
-    stays = d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
+    stays = d.law is not None or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
     outputs = d.case.plant.outputs
     return _plain(
         {
@@ -103,17 +113,18 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "findings": [_finding(d, e) for e in d.shown],
             "alternatives": [
                 {"effect": e, "where": w, "probability": round(p, 4)}
+                | ({"why_not": UNCONFIRMED} if (e, w) in d.refused else {})
                 for (e, w), p in d.decision.alternatives
                 if (e, w) not in keys
             ],
             "mismatch": _mismatch(d),
             "remainder": {
-                "share_closed": d.worth.share_closed if d.shown else 0.0,
+                "share_closed": d.worth.share_closed if d.extends else 0.0,
                 "rms": d.remainder.rms,
                 "over_noise": d.remainder.over_noise,
                 "node": d.remainder.node,
                 "follows": d.remainder.follows,
-                "law": law_entry(d.law),
+                "law": law_entry(d.law, d.worth),
             }
             if stays
             else None,
@@ -124,7 +135,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "converged": d.null.fit.converged and d.final.fit.converged,
                 "held_out_before": d.worth.before,
                 "held_out_refit_only": d.worth.refit_only,
-                "held_out_after": d.worth.after if d.shown else d.worth.refit_only,
+                "held_out_after": d.worth.after if d.extends else d.worth.refit_only,
                 "held_out": "recordings " + ", ".join(d.worth.names)
                 if d.worth.reserved
                 else "cross-validated: too few recordings to set one aside",
@@ -144,7 +155,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
 
 def _notes(d: Diagnosis) -> list[str]:
     """Return the assumptions and the cautions, as sentences."""
-    unnamed = [e.key for e in d.final.hypothesis.effects if e not in d.shown]
+    unnamed = [e.key for e in d.final.hypothesis.effects if e not in d.shown and not isinstance(e, PlacedLaw)]
     return [
         *d.case.notes,
         *doubts(d.case, d.final.fit, d.before.noise),
@@ -215,6 +226,7 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "where": e.key[1],
         "when": None if first is None else [[first, min(ends.get("end", last), last)]],
         "probability": round(d.posterior.effects.get(e.key, 0.0), 4),
+        "confirmed": round(d.asked.get(e.key, 1.0), 4),
         "equation": equation,
         "parameters": {
             n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
@@ -316,9 +328,6 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "log_evidence": w.fitted.log_evidence - null,
                 "log_prior_odds": w.log_odds,
                 "posterior": d.posterior.hypotheses.get(keys, 0.0),
-                "with_unknown_law": {
-                    f"{e} at {at}": s - w.score for (own, (e, at)), s in d.laws.items() if own == keys
-                },
                 "physics": None if physics is None else [physics[k] for k in sorted(keys)],
                 "remainder": max(w.fitted.average.remainder),
                 "rms": w.fitted.fit.rms(),
@@ -350,7 +359,9 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
                     "beside": beside,
                     "probability": d.posterior.effects.get(key, 0.0),
                     "below_best": final - w.score,
-                    "reason": "less likely than the findings"
+                    "reason": UNCONFIRMED
+                    if key in d.refused
+                    else "less likely than the findings"
                     if key in standouts(d.physics.get(keys, {}))
                     else "does not stand out of the misfit that it leaves",
                 }

@@ -58,11 +58,14 @@ class Weighed:
 class Searched:
     """All hypotheses tried, best first; whether the budget ended the search.
 
-    `norms`: of all columns in the screening without effects; empty where there was none, or only of some."""
+    `norms`: of all columns in the screening without effects; empty where there was none, or only of some.
+    `seen`: hypotheses that were extended; `where`: the places where each effect fits."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
     norms: Sequence[Norms] = ()
+    seen: frozenset[Keys] = frozenset()
+    where: Mapping[str, set[str]] = field(default_factory=dict)
 
 
 @dataclass
@@ -126,7 +129,13 @@ def search(case: Case, limits: Limits) -> Searched:
     if with_observer(s):
         grow(s)
         swap(s)
-    return Searched(tuple(sorted(s.tried.values(), key=lambda w: -w.score)), case.budget.spent, s.norms)
+    return searched(s)
+
+
+def searched(s: Search) -> Searched:
+    """Return the result of a search."""
+    order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
+    return Searched(order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where)
 
 
 def started(case: Case, limits: Limits) -> Search:
@@ -184,8 +193,12 @@ def swap(s: Search) -> None:
 
 
 def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
-    """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails."""
+    """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails.
+
+    It fails for a law: the catalogue has no place for it."""
     case, known = s.case, values.rough_plant
+    if any(e.key[0] not in case.catalogue for e in effects):
+        return None
     parameters = {n: known.parameters.get(n, p) for n, p in case.plant.parameters.items()}
     plant = dataclasses.replace(case.plant, parameters=parameters)
     entries = {e.key[0]: e.candidate.effect for e in effects}

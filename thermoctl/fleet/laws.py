@@ -44,7 +44,7 @@ def shared(laws: Mapping[str, Mapping[str, Any]]) -> list[Shared]:
     """Return the shapes of terms that two or more rigs have. `laws`: `remainder.law` of each rig's result."""
     found: dict[Term, dict[str, tuple[float, float]]] = {}
     for rig, law in laws.items():
-        for t in law.get("terms", ()):
+        for t in law.get("forms", ()):
             for shape, name in t["shapes"].items():
                 p = law["parameters"][name]
                 if p["sd"]:
@@ -69,7 +69,7 @@ def side_by_side(laws: Mapping[str, Mapping[str, Any]]) -> Table:
     for rig, law in laws.items():
         intervals = [
             f"{name} {p['value']:.3g} ± {WIDE * p['sd']:.2g}"
-            for t in law.get("terms", ())
+            for t in law.get("forms", ())
             for name in t["shapes"].values()
             if (p := law["parameters"][name])["sd"]
         ]

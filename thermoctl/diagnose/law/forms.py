@@ -22,6 +22,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.shipped import shipped
 
+LAW = "law"  # name of a law among the effects of a hypothesis
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -261,7 +263,7 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
         ends = {"into": "target", **({"from": "source"} if place.source else {})}
         changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(
-        "law",
+        LAW,
         "A law that the recordings propose",
         "",
         (),

@@ -27,6 +27,19 @@ NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all r
 RANGE = 100.0  # times its first size that the size of a term may reach
 
 
+@dataclasses.dataclass(frozen=True)
+class PlacedLaw(Placed):
+    """A law among the effects of a hypothesis, with its terms; other laws there, and the share of each."""
+
+    proposal: Proposal
+    rivals: tuple[tuple[Proposal, Fitted, float], ...] = ()
+
+
+def law_of(f: Fitted) -> PlacedLaw | None:
+    """Return the last law of a hypothesis, None where it holds none."""
+    return next((e for e in reversed(f.hypothesis.effects) if isinstance(e, PlacedLaw)), None)
+
+
 def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fitted | None:
     """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
 
@@ -38,7 +51,7 @@ def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fit
     own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
     c = dataclasses.replace(c, effect=_bounded(c, ranges))
     try:
-        return fitted(case, plant, (*parent.hypothesis.effects, Placed(c, own)), None, leader, parent)
+        return fitted(case, plant, (*parent.hypothesis.effects, PlacedLaw(c, own, p)), None, leader, parent)
     except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
         return None
 
@@ -107,8 +120,9 @@ def affordable(case: Case, parent: Fitted) -> int:
 
 
 def law_rate(f: Fitted) -> ex.Expr:
-    """Return the flow, or the storage, of the law that a hypothesis holds as its last effect."""
-    law = f.hypothesis.effects[-1]
+    """Return the flow, or the storage, of the last law that a hypothesis holds."""
+    law = law_of(f)
+    assert law is not None
     own, nodes = set(law.own.values()), law.candidate.place.nodes
     if "storage" in law.candidate.effect.changes[0][-1]:
         return f.plant.nodes[nodes["target"]].storage
@@ -122,7 +136,9 @@ def at_bound(f: Fitted) -> bool:
 
 def equation(rate: ex.Expr, f: Fitted) -> str:
     """Return a law's flow with short names of its parameters."""
-    c, text = f.hypothesis.effects[-1].candidate, readable(rate)
+    law = law_of(f)
+    assert law is not None
+    c, text = law.candidate, readable(rate)
     for q in c.effect.parameters:
         text = re.sub(rf"\b{re.escape(c.own(q.name))}\b", q.name, text)
     return re.sub(rf"\b(m\d)_{re.escape(c.own('')[1:])}\b", r"\1", text)

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.held_out import Worth
 from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.propose import Proposal
 from thermoctl.diagnose.law.refit import equation, law_rate
@@ -26,26 +27,29 @@ WIDE = 1.96  # standard deviations to either side of a 95 % interval
 EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 
 
-def law_entry(law: Law | None) -> dict[str, Any] | None:
+def law_entry(law: Law | None, worth: Worth) -> dict[str, Any] | None:
     """Return `remainder.law` of diagnosis.json."""
     if law is None:
         return None
     f, p, place = law.fitted, law.proposal, law.proposal.place
     return {
-        "expression": equation(law.rate, f),
+        "where": place.where,
         "part": place.part,
+        "expression": equation(law.rate, f),
         "into": place.target,
         "from": place.source,
-        "terms": _terms(p),
+        "terms": [str(t.expression(k)) for k, t in enumerate(p.terms, 1)],
+        "forms": _terms(p),
         "memory": {f"m{k}": t.memory_text(k) for k, t in enumerate(p.terms, 1) if t.form.memory},
-        "variables": sorted({s.label for t in p.terms for s in t.signals}),
+        "of": sorted({s.label for t in p.terms for s in t.signals}),
         "parameters": _parameters(law),
         "probability": round(law.probability, 4),
+        "confirmed": round(law.confirmed, 4),
         "gain": law.gain,
         "rms": f.fit.rms(),
-        "share_closed": law.closed,
-        "held_out": law.worth.reserved,
-        "family": family(law),
+        "share_closed": worth.share_closed,
+        "held_out": worth.reserved,
+        "equivalent": family(law),
         "effect": effect_file(law),
     }
 
@@ -98,19 +102,18 @@ def described(p: Proposal, f: Fitted) -> str:
     return f"{equation(law_rate(f), f)} at {p.place.where}"
 
 
-def law_section(law: Law | None) -> str:
+def law_section(law: Law | None, entry: Mapping[str, Any] | None) -> str:
     """Return the report's section: the law, its parameters, its family, and the curve with its band."""
-    if law is None:
+    if law is None or entry is None:
         return ""
-    entry = law_entry(law) or {}
     body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
     rows = [
         (n, p["value"], unit(p["unit"]), f"± {WIDE * p['sd']:.2g}" if p["sd"] else "known")
         for n, p in entry["parameters"].items()
     ]
     body += table(("parameter", "value", "unit", "95 %"), rows)
-    if entry["family"]:
-        body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["family"]) + "</ul>"
+    if entry["equivalent"]:
+        body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["equivalent"]) + "</ul>"
     where = "recordings set aside" if entry["held_out"] else "cross-validated data"
     body += f"<p>On {where} it closes {100 * entry['share_closed']:.0f} % of the energy of the misfit.</p>"
     return (

@@ -36,10 +36,10 @@ def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) 
         ("What next", _p(what_next(result)) + _experiment(result["next_experiment"])),
         ("Where", _place(found, result)),
         ("What was found", _findings(found, result)),
-        ("What it is worth" if found.shown else "How well the plant fits", _worth(found, result)),
+        ("What it is worth" if found.extends else "How well the plant fits", _worth(found, result)),
         ("Before and after", _curves(found)),
         ("What remains", _remains(found, result)),
-        ("A law for the remainder", law_section(found.law)),
+        ("A law for the remainder", law_section(found.law, (result["remainder"] or {}).get("law"))),
         ("Why this verdict", _why(result)),
         ("Tried and lost", _lost(result)),
         ("Parameters before and after", _parameters(found)),
@@ -120,7 +120,7 @@ def _similar(e: Placed, result: Mapping[str, Any]) -> str:
 def _worth(found: Diagnosis, result: Mapping[str, Any]) -> str:
     fit, outputs = result["fit"], result["outputs"]
     keys = ["before", "refit_only", "after", "held_out_before", "held_out_refit_only", "held_out_after"]
-    if not found.shown:
+    if not found.extends:
         keys = [k for k in keys if not k.endswith("after")]
     heads = {"before": "as it came", "refit_only": "refitted", "after": "with the findings"}
     rows = [
@@ -165,7 +165,7 @@ def _curves(found: Diagnosis) -> str:
             top.plot(t, y, ".", ms=2.5, color=_COLOURS["measured"], label="measured")
             top.plot(t, y - e0, color=_COLOURS["refit"], lw=1.2, label="refitted only")
             low.plot(t, e0, color=_COLOURS["refit"], lw=0.9)
-            if found.shown:
+            if found.extends:
                 top.plot(t, y - e1, color=_COLOURS["with"], lw=1.2, label="with the findings")
                 low.plot(t, e1, color=_COLOURS["with"], lw=0.9)
             low.axhline(0, color="0.6", lw=0.8)
@@ -199,7 +199,7 @@ def _remains(found: Diagnosis, result: Mapping[str, Any]) -> str:
     ]
     body = table(("output", "remainder, rms", "sensor's noise", "whole residual over the noise"), rows)
     facts = []
-    if found.shown and r["share_closed"] is not None:
+    if found.extends and r["share_closed"] is not None:
         facts.append(
             f"The findings close {100 * max(r['share_closed'], 0.0):.1f} % of the energy of the misfit that a refit leaves."
         )
@@ -208,11 +208,11 @@ def _remains(found: Diagnosis, result: Mapping[str, Any]) -> str:
     follows = ", ".join(r["follows"])
     facts.append(f"It follows {follows}." if follows else "It follows none of the recorded signals.")
     for m in result["mismatch"][:1]:
-        if m["missing_flow_rms"] and not found.shown:
+        if m["missing_flow_rms"] and not found.extends:
             size = f"{m['missing_flow_rms']:.3g} {unit(m['missing_flow_unit'])}".strip()
             facts.append(f"A flow of {size} (rms) into {m['node']} would bring the plant to the recordings.")
     for m in result["mismatch"]:
-        if m["when"] and not found.shown:
+        if m["when"] and not found.extends:
             spans = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m["when"][:6])
             facts.append(f"The error of {m['channel']} is largest at {spans}.")
     return body + _items(facts)
@@ -290,7 +290,7 @@ def _parameters(found: Diagnosis) -> str:
             (_named(n, e.unit), first, refit.value, e.value, f"± {WIDE * e.sd:.2g}", "; ".join(words) or "ok")
         )
         moved = abs(refit.value - e.value)
-        if found.shown and moved > max(MOVED * np.hypot(e.sd, refit.sd), MOVED_SHARE * abs(e.value)):
+        if found.extends and moved > max(MOVED * np.hypot(e.sd, refit.sd), MOVED_SHARE * abs(e.value)):
             changed.append(
                 f"{n}: a refit alone put it at {refit.value:.4g}; with the findings it is {e.value:.4g} {e.unit or ''}. "
                 "It had stood in for the missing physics."

@@ -1,0 +1,55 @@
+"""A name has to predict parts of the recordings that it was not fitted to."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import wilcoxon
+
+from thermoctl.diagnose.confirm import Confirm, confirmed, signed_rank
+from thermoctl.diagnose.decide import Posterior
+
+A, B = ("radiation", "block"), ("sensor_drift", "reading")
+NONE, ONE, BOTH = frozenset(), frozenset({A}), frozenset({A, B})
+
+
+@given(st.lists(st.integers(-1000, 1000).filter(bool), min_size=3, max_size=40, unique_by=abs))
+def test_the_signed_rank_probability_is_scipys(values):
+    d = np.array(values, float)
+    expected = 1 - wilcoxon(d, alternative="greater", method="exact").pvalue
+    assert signed_rank(d) == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_effect_that_helps_in_one_part_only_is_not_confirmed():
+    rng = np.random.default_rng(3)
+    noise = rng.normal(0, 0.02, 8)
+    once, always = noise.copy(), noise + 0.3
+    once[2] += 5.0
+    assert signed_rank(once) < 0.9 < signed_rank(always)
+
+
+def with_errors(energies):
+    """The test, on stated errors (parts, outputs) of each hypothesis instead of refits."""
+    test = Confirm(SimpleNamespace(), dict.fromkeys(energies), ())
+    test._known = {keys: np.log(np.array(e)[:, None]) for keys, e in energies.items()}
+    return test
+
+
+def test_the_weakest_name_leaves_first_and_the_rest_is_asked_again():
+    alone = np.full(8, 2.0)
+    beside = alone * np.array([0.1, 1.01, 1.0, 1.02, 1.01, 1.0, 1.03, 1.02])  # it imitates the first part
+    test = with_errors({NONE: np.full(8, 50.0) + np.arange(8), ONE: alone, BOTH: beside})
+    posterior = Posterior({BOTH: 1.0}, {A: 1.0, B: 1.0}, 1.0)
+    kept, after, asked = confirmed(posterior, BOTH, test, 0.9)
+    assert kept == ONE
+    assert after.effects[A] > 0.99 and after.effects[B] == asked[B] < 0.9
+
+
+def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():
+    test = with_errors({NONE: np.full(8, 50.0), ONE: np.full(8, 1.0)})
+    test._known[ONE] = None
+    assert test.probability(ONE, A) == 0.0
