@@ -310,6 +310,6 @@ wire-rigs: develop                 # four shipped rigs at the wire: calibrated, 
 	$(BIN)/python -m tests.rigs.wire_rigs
 
 .PHONY: prove-tune
-TUNES ?= 200
+TUNES ?= 100
 prove-tune: develop                # tunes on loops of known truth, with skipped ticks and slow commands: docs/proof/tuning.md; minutes
 	$(BIN)/python -m tests.tune.prove --number $(TUNES) --page docs/proof/tuning.md
