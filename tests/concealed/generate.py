@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.linalg import qr
 from scipy.optimize import least_squares
 
 from tests.concealed import sensors
@@ -195,11 +196,18 @@ class Bench:
                 (high - scene.theta[p]) * 4 / (high - low),
             )
 
+        left: dict[tuple[float, ...], np.ndarray] = {}
+
         @lru_cache(maxsize=1)
         def at(x: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+            """Residual and slopes, turned so that all but np + 1 rows are zero: the steps are those of the whole."""
             # a truth takes as long for one variant as for thirty: the slopes come with the readings
             base, slopes = self.tangents(np.array(x))
-            return np.append(self.off(readings, base), x), np.concatenate([-slopes, np.eye(free)], axis=1).T
+            left[x] = np.append(self.off(readings, base), x)
+            whole = np.empty((len(left[x]), free + 1), order="F")
+            whole[:-free, :-1], whole[-free:, :-1], whole[:, -1] = -slopes.T, np.eye(free), left[x]
+            turned = qr(whole, mode="r", overwrite_a=True, check_finite=False)[0][: free + 1]
+            return turned[:, -1], turned[:, :-1]
 
         found = least_squares(
             lambda x: at(tuple(x))[0],
@@ -209,7 +217,7 @@ class Bench:
             ftol=CONVERGED,
             xtol=CONVERGED,
         )
-        return np.append(found.fun[:-free], -found.x)
+        return np.append(left[tuple(found.x)][:-free], -found.x)
 
     def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:
         """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal.
