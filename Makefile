@@ -286,6 +286,10 @@ scenarios: install                 # every fault scenario at the wire, twice, id
 armed-hour: install                # both rigs armed for an hour of real time on slow, lossy Modbus; docs/proof/armed-hour.md
 	$(BIN)/python -m tests.scenarios.armed_hour --page docs/proof/armed-hour.md
 
+.PHONY: device-files
+device-files: develop              # which DBC and EDS files below FOLDER can be used, warned of, refused; docs/proof/device-files.md
+	@$(BIN)/python -m tests.devices.public_files "$(FOLDER)"
+
 .PHONY: devices
 devices: develop                   # every profile of the library against its emulator; the table: docs/proof/devices.md
 	@mkdir -p build

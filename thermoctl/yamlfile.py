@@ -301,11 +301,18 @@ def kind_of(node: Node) -> str:
     return "nothing" if v is None else repr(v)[:80]
 
 
+def _hexadecimal(value: Any) -> Any:
+    """Return the number of text such as 0x7FFF; any other value as it is."""
+    if isinstance(value, str) and re.fullmatch(r"[-+]?0[xX][0-9A-Fa-f]{1,16}", value):
+        return int(value, 16)
+    return value
+
+
 def number_of(
     node: Node, label: str, low: float = -math.inf, high: float = math.inf, unit: str = ""
 ) -> float:
     """Return a node's number within low..high; `label` and `unit` describe it in the InputError."""
-    value = node.value
+    value = _hexadecimal(node.value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
         in_unit = f" in {unit}" if unit else ""
         raise node.error(f"{label}: a number{in_unit} was expected, found {kind_of(node)}")
@@ -316,9 +323,7 @@ def number_of(
 
 def integer_of(node: Node, label: str, low: int = 0, high: int = 2**32) -> int:
     """Return a node's whole number within low..high; `label` names it in the InputError."""
-    value = node.value
-    if isinstance(value, str) and re.fullmatch(r"0x[0-9A-Fa-f]{1,8}", value):
-        value = int(value, 16)
+    value = _hexadecimal(node.value)
     if isinstance(value, bool) or not isinstance(value, int):
         raise node.error(f"{label}: a whole number was expected, found {kind_of(node)}")
     if not low <= value <= high:

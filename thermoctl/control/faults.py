@@ -56,7 +56,8 @@ KINDS = tuple(_KINDS)
 
 _BUS_OFF = (
     "On CAN, `bus-off` means that the adapter left the bus after too many transmission errors: "
-    "usually a wrong bitrate, a missing terminator or a short between CAN_H and CAN_L."
+    "usually a wrong bitrate, a missing terminator or a short between CAN_H and CAN_L. SocketCAN, gs_usb, PCAN and "
+    "interfaces that report a state tell it; an `slcan` adapter has no message for it: there the device is only silent."
 )
 
 _READINGS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from thermoctl_hal.base.profile import Channel, Profile
 EXCLUSIVE = ("slcan:", "rtu:", "/")
 """Prefixes of ports that are a path, which only one program can open at a time."""
 NETWORK = "socket://"
+NO_VALUE = 9.8e37
+"""Raw numbers from there on are no reading: devices with SCPI send 9.9E37 or 9.91E37 (overload, no value)."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,13 @@ class Bound:
     offset: float
     low: float
     high: float
+
+
+def limits_of(channel: Channel) -> tuple[float, float]:
+    """Return the range of a channel's readings; without one, all that are no 9.9E37 of SCPI."""
+    most = NO_VALUE * abs(channel.scale)
+    low, high = (max(-most, min(most, v)) if math.isinf(v) else v for v in channel.range)
+    return low, high
 
 
 @dataclass(frozen=True)

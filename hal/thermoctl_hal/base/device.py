@@ -15,7 +15,7 @@ import numpy as np
 
 from thermoctl.rig.channels import AxesChannels
 from thermoctl_hal.base.backend import ERROR, STALE, Sample
-from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.binding import NO_VALUE, Binding
 from thermoctl_hal.base.wire import Channels
 
 SLOW_BUSES = ("modbus",)
@@ -88,7 +88,7 @@ class Device:
                 sample,
                 bound,
                 f"reading {raw * b.scale + b.offset:g} is outside {b.low:g} .. {b.high:g}: "
-                "check sensor and wiring",
+                + ("overload, or no value" if abs(raw) > NO_VALUE else "check sensor and wiring"),
             )
 
     def fail(self, sample: Sample, bound: int, problem: str) -> None:

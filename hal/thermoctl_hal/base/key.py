@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from thermoctl.yamlfile import Section, suggest
+from thermoctl.yamlfile import Node, Section, number_of, suggest
 
 REQUIRED: Any = ...
 
@@ -35,6 +36,33 @@ def bits_of(of: str) -> tuple[Key, ...]:
     return (
         Key("low_bit", "integer", f"lowest bit of the value inside {of}", 0, "", 0, 63, example="4"),
         Key("bits", "integer", f"number of bits of the value; 0: all of {of}", 0, "", 0, 64, example="19"),
+    )
+
+
+def sentinel_of(node: Node, bits: int, is_signed: bool, letter: str = "") -> float:
+    """Return a sentinel as the raw number that it is read as. letter: f, d of a float type, else ''.
+
+    Hexadecimal text is the bits of the number: 0x8000 of 16 bits with sign is -32768. Raises InputError where
+    the type cannot hold it."""
+    value = number_of(node, "sentinels")
+    is_text = isinstance(node.value, str)
+    if letter:
+        whole = int(value).to_bytes(bits // 8, "big") if is_text and 0 <= value < 1 << bits else b""
+        try:
+            return float(struct.unpack(f">{letter}", whole or struct.pack(f">{letter}", value))[0])
+        except OverflowError:
+            raise node.error(f"sentinels: {value:g} is no float of {bits} bits") from None
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+    if is_text and high < value < 1 << bits:
+        return float(value - (1 << bits))
+    if low <= value <= high and value == int(value):
+        return float(value)
+    kind = f"{bits} bits {'with' if is_signed else 'without'} sign"
+    same = int(value) & (1 << bits) - 1
+    hint = f"; its bits 0x{same:X} are read as {same - (1 << bits) * (is_signed and same > high)}"
+    raise node.error(
+        f"sentinels: {value:g} cannot come: {kind} hold {low} .. {high}"
+        + (hint if value == int(value) and -(1 << bits - 1) <= value < 1 << bits else "")
     )
 
 

@@ -46,6 +46,7 @@ FRAME_TYPES: dict[str, tuple[str, int]] = {
 }
 """Types of fields of a binary frame: kind and bytes."""
 WORD_BYTES = 2  # of a Modbus register
+NULL_ADDRESS = 0xFE  # source address of J1939 that no sender has
 
 
 class Object(NamedTuple):
@@ -184,6 +185,8 @@ class Dbc(BusSpec):
     node_shift: int = (
         -1
     )  # the device's address, shifted by so many bits, is part of every identifier; -1: not
+    faults: Mapping[str, str] = field(default_factory=dict)  # MESSAGE or MESSAGE.SIGNAL -> why it is unusable
+    warning: str = ""  # file, line and message of what was read in spite of a fault
 
     def can_id(self, message: str, address: int) -> int:
         """Return the identifier of a message, with bit 31 for 29 bits."""
@@ -191,13 +194,21 @@ class Dbc(BusSpec):
         node = address << self.node_shift if self.node_shift >= 0 else 0
         return found.frame_id + node | (0x8000_0000 if found.is_extended_frame else 0)
 
+    def is_j1939(self, message: str) -> bool:
+        """Return whether a message is received by its parameter group, from any source address.
+
+        So are messages of the DBC format J1939PG, and those of source address 254, which no sender has."""
+        found = self.database.get_message_by_name(message)
+        no_sender = found.is_extended_frame and found.frame_id & 0xFF == NULL_ADDRESS
+        return self.node_shift < 0 and (found.protocol == "j1939" or no_sender)
+
 
 @dataclass(frozen=True)
 class DbcSource:
     """A signal of a message of the DBC file.
 
-    `invalid`: test of another signal of the message that a good reading passes. `sentinels`: values that mean
-    'no reading'."""
+    `invalid`: test of another signal of the message that a good reading passes. `sentinels`: raw numbers that
+    mean 'no reading'."""
 
     message: str
     signal: str
@@ -259,7 +270,8 @@ class Register:
     """A value in Modbus registers; `sentinels` are raw numbers for 'no reading' (an open thermocouple).
 
     bits: (lowest, count) of the bits that hold the value, count 0 for all; `signed`: they are a two's
-    complement. `invalid`: the register and the test that a good reading passes."""
+    complement. `invalid`: the register and the test that a good reading passes. `exponent`: the register of a
+    whole number n, of a value that counts 10**n (SunSpec)."""
 
     kind: str
     address: int
@@ -270,6 +282,7 @@ class Register:
     bits: tuple[int, int] = (0, 0)
     signed: bool = False
     invalid: tuple[Register, Condition] | None = None
+    exponent: Register | None = None
 
     @property
     def words(self) -> int:

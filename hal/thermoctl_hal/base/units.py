@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import unicodedata
 
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "um": {"um": (1, 0), "nm": (1e-3, 0), "mm": (1e3, 0), "m": (1e6, 0), "in": (25400, 0)},
@@ -13,8 +15,28 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "": {"1": (1, 0)},
 }
 """Suffix of the role's name -> {unit: (factor, offset)}."""
-_DBC_UNITS = {"°C": "degC", "C": "degC", "deg C": "degC", "Celsius": "degC", "µm": "um", "μm": "um"}
-"""Spelling of a unit in DBC files -> our spelling, where they differ."""
+_SPELLINGS = {
+    "degC": "c degc celsius degcelsius degreec degreescelsius degreecelsius grdc gradc centigrade",
+    "degF": "f degf fahrenheit degfahrenheit degreef degreesfahrenheit gradf grdf",
+    "K": "k kelvin degk",
+    "deg": "deg degree degrees grad °",
+    "rad": "radian radians rads",
+    "arcsec": "arcsecond arcseconds",
+    "in": "inch inches",
+    "m": "meter metre meters metres",
+    "V": "v volt volts",
+    "A": "a amp amps ampere amperes",
+    "rpm": "rpm 1/min min-1 u/min rev/min",
+    "Pa": "pa pascal",
+    "bar": "bar",
+    "%": "% percent",
+}
+"""Our spelling of a unit -> those of other files in lower case, without blanks, points and brackets."""
+_KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+_WORDS = {"micro": "u", "milli": "m", "kilo": "k", "nano": "n", "centi": "c", "mega": "M"}
+_PREFIXED = {p + u: p + u for p in "numckM" for u in ("m", "V", "A", "rad", "K", "Pa", "bar")}
+"""Units with a prefix, which are written exactly so: mV is not MV."""
+_DEGREES = "°˚\ufffd"  # the degree sign, its look-alikes, and a sign that no encoding knew
 
 
 def role_units(role: str) -> dict[str, tuple[float, float]]:
@@ -23,10 +45,25 @@ def role_units(role: str) -> dict[str, tuple[float, float]]:
 
 
 def dbc_unit(text: str | None) -> str:
-    """Return the unit of a DBC file in our spelling."""
-    return _DBC_UNITS.get(text or "", text or "")
+    """Return the unit of a DBC file in our spelling; a unit that is not known as it stands."""
+    plain = (
+        unicodedata.normalize("NFKC", (text or "").replace("º", "°").replace("ᵒ", "°"))
+        .replace("Â", "")
+        .replace("μ", "u")
+        .replace("µ", "u")
+    )
+    plain = re.sub(r"[\s._\[\](){}]", "", plain)
+    for word, prefix in _WORDS.items():
+        if plain.lower().startswith(word) and len(plain) > len(word):
+            unit = dbc_unit(plain[len(word) :])
+            plain = prefix + unit if prefix + unit in _PREFIXED else plain
+    if plain in _PREFIXED:
+        return _PREFIXED[plain]
+    is_degree = len(plain) > 1 and plain[0] in _DEGREES
+    key = ("deg" + plain[1:] if is_degree else plain).lower()
+    return "um" if key in ("micron", "microns") else _KNOWN.get(key, text or "")
 
 
 def is_convertible(unit: str) -> bool:
-    """Return whether another unit of the same quantity is known."""
-    return any(unit in units for units in _UNITS.values() if len(units) > 1)
+    """Return whether it is a unit that we know, so that another one means other numbers."""
+    return unit in _SPELLINGS or unit in _PREFIXED or any(unit in u for u in _UNITS.values() if len(u) > 1)

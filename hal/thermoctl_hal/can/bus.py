@@ -11,8 +11,12 @@ A port is written "interface:channel@bitrate,second"; the default bitrate is 100
                                   `second` is the data bitrate of CAN FD; without it the bus is classic
 
 Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
-number. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
+number. A device may want a parameter group of J1939 instead, BY_PGN | its number: from any source address, at
+any priority. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
 `long_frames`: a device that does not expect them never sees them.
+
+Bus-off: the kernel's error frames and those of gs_usb tell it, PCAN raises an error, others report a state
+(`can.BusState.ERROR`). An slcan adapter has no message for it.
 """
 
 from __future__ import annotations
@@ -47,15 +51,34 @@ _SLCAN_BITRATES = {
 }
 SLCAN_BAUD = 3_000_000
 SHARED = ("socketcan", "virtual", "udp_multicast")  # any number of programs and devices may open these
+KERNEL_ERRORS = ("gs_usb", "socketcan", "socketcand")  # whose error frames are those of the kernel
 NEVER_BLOCK = ("virtual", "udp_multicast")  # interfaces whose recv(0) returns at once
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
 _FD_FRAME = struct.Struct("=IB3x64s")  # struct canfd_frame
 _REMOTE, _ERROR_FLAG, _BUS_OFF = 0x4000_0000, 0x2000_0000, 0x40
 
 
+BY_PGN = 1 << 32
+"""Marks the number of a parameter group among the identifiers that a device wants."""
+_PGN, _PGN_TO_ALL, _TO_ONE = 0x3FFFF00, 0x3FF0000, 240  # a PF below 240 is followed by the receiver's address
+BUS_OFF = "CAN bus-off: check wiring, termination and bitrate"
+
 NO_FD = (
     "the device takes CAN FD frames: give an interface with a data bitrate, as socketcan:can0@1000000,5000000"
 )
+
+
+def pgn_of(can_id: int) -> int:
+    """Return BY_PGN | the parameter group of an identifier of 29 bits; 0 for one of 11 bits."""
+    if not can_id & EXTENDED:
+        return 0
+    is_to_one = can_id >> 16 & 0xFF < _TO_ONE
+    return BY_PGN | (can_id & (_PGN_TO_ALL if is_to_one else _PGN)) >> 8
+
+
+def is_wanted(can_id: int, ids: frozenset[int]) -> bool:
+    """Return whether `ids` has the identifier or its parameter group."""
+    return can_id in ids or pgn_of(can_id) in ids
 
 
 class SlcanPort(SlcanLine):
@@ -105,6 +128,7 @@ class LibraryPort(CanPort):
         self._wanted = None if in_kernel or not ids else frozenset(ids)
         self._bus: Any
         self._is_fd = bool(data_bitrate)
+        self._has_kernel_errors = interface in KERNEL_ERRORS
         fd: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if data_bitrate else {}
         try:
             self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel, **fd)
@@ -207,11 +231,23 @@ class LibraryPort(CanPort):
         can_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if message.is_error_frame:
             self.bad += 1
+            if message.arbitration_id & _BUS_OFF and self._has_kernel_errors:
+                raise HardwareError(BUS_OFF)
+            self._check_state()
         elif message.is_remote_frame:
             self.ignored += 1
-        elif self._wanted is None or can_id in self._wanted:
+        elif self._wanted is None or is_wanted(can_id, self._wanted):
             return self._sort(can_id, bytes(message.data), message.is_fd)
         return 0
+
+    def _check_state(self) -> None:
+        """Raise HardwareError where the interface reports bus-off as its state."""
+        try:
+            is_off = self._bus.state is self._library.BusState.ERROR
+        except Exception:  # many interfaces of python-can have none
+            return
+        if is_off:
+            raise HardwareError(BUS_OFF)
 
     def _sort(self, can_id: int, data: bytes, is_fd: bool) -> int:
         """Deliver a frame, or keep it for `long_frames`; 1 when it was delivered."""
@@ -240,7 +276,7 @@ class LibraryPort(CanPort):
         if raw_id & _ERROR_FLAG:
             self.bad += 1
             if raw_id & _BUS_OFF:
-                raise HardwareError("CAN bus-off: check wiring, termination and bitrate")
+                raise HardwareError(BUS_OFF)
             return 0
         if raw_id & _REMOTE:
             self.ignored += 1
@@ -271,6 +307,10 @@ class LibraryPort(CanPort):
 
 
 def _kernel_filter(can_id: int) -> dict[str, int | bool]:
+    if can_id & BY_PGN:
+        number = (can_id & ~BY_PGN) << 8
+        is_to_one = number >> 16 & 0xFF < _TO_ONE
+        return {"can_id": number, "can_mask": _PGN_TO_ALL if is_to_one else _PGN, "extended": True}
     extended = bool(can_id & EXTENDED)
     mask = 0x1FFF_FFFF if extended else 0x7FF
     return {"can_id": can_id & ~EXTENDED, "can_mask": mask, "extended": extended}
@@ -295,11 +335,11 @@ class Hub:
         try:
             for can_id, data in self.adapter.receive():
                 for port in self.ports:
-                    if can_id in port.ids:
+                    if is_wanted(can_id, port.ids):
                         port.inbox.append((can_id, data))
             for can_id, data in self.adapter.long_frames():
                 for port in self.ports:
-                    if can_id in port.ids:
+                    if is_wanted(can_id, port.ids):
                         port.long_inbox.append((can_id, data))
         except (OSError, HardwareError):
             self.broken = True

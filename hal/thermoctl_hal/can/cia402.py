@@ -14,12 +14,12 @@ from __future__ import annotations
 import contextlib
 import struct
 import time
-from typing import Any
 
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
 from thermoctl_hal.base.wire import CanPort
+from thermoctl_hal.can.eds import read_eds
 
 SYNC_ID, NMT_ID = 0x080, 0x000
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
@@ -57,16 +57,13 @@ class Objects:
         if spec.eds is None:
             self.place, self.eds = place, None
             return
-        import canopen  # takes a second; only rigs with a drive need it
-
         self.place, self.eds = place, spec.eds
-        self._variable: Any = canopen.objectdictionary.ODVariable
         try:
-            self._dictionary: Any = canopen.import_od(str(spec.eds), node_id=node)
-        except Exception as e:  # the parsers of two libraries
-            raise InputError(
-                f"{place}: {spec.eds}: no EDS file: {(str(e).splitlines() or [type(e).__name__])[0]}"
-            ) from None
+            self._file = read_eds(spec.eds)
+        except OSError as e:
+            raise InputError(f"{place}: {spec.eds}: cannot be read: {e.strerror}") from None
+        except ValueError as e:
+            raise InputError(f"{place}: {spec.eds}: no EDS file: {e}") from None
 
     def format(self, item: Object, key: str) -> str:
         """Return the struct letter of an object; `key` is the profile's key that names it."""
@@ -78,19 +75,29 @@ class Objects:
                     f"'eds' file, or say objects: {{'{object_name(item)}': int32}}"
                 )
             return FIELD_TYPES[self._known[item]]
-        found = self._dictionary.get(index)
-        if found is None:
+        if not self._file.has(index):
             raise self._error(item, key, "is not in it")
-        if not isinstance(found, self._variable):
-            subs = [k for k in found.subindices if k > 0]
-            if sub == 0:
-                names = ", ".join(object_name(Object(index, k)) for k in subs[:4])
-                raise self._error(item, key, f"has sub-indices; say which, as {names}")
-            if sub not in subs:
-                raise self._error(item, key, f"has no sub-index {sub}; it has {', '.join(map(str, subs))}")
-            found = found[sub]
-        elif sub:
+        subs = self._file.subs(index)
+        if subs and sub == 0:
+            names = ", ".join(object_name(Object(index, k)) for k in subs[:4])
+            raise self._error(item, key, f"has sub-indices; say which, as {names}")
+        if sub and not subs:
             raise self._error(item, key, "has no sub-indices")
+        if sub and sub not in subs:
+            raise self._error(item, key, f"has no sub-index {sub}; it has {', '.join(map(str, subs))}")
+        found = self._file.entries[item]
+        if found.again is not None and found.again.data_type != found.data_type:
+            raise self._error(
+                item,
+                key,
+                f"stands twice with different types (lines {found.line}, {found.again.line}): keep one",
+            )
+        if found.data_type is None:
+            raise self._error(
+                item,
+                key,
+                f"(line {found.line}) has no DataType: add it to the file, as DataType=0x0004 for int32",
+            )
         letter = _FORMATS.get(found.data_type)
         if letter is None:
             raise self._error(item, key, f"({found.name}) is no whole number of up to 4 bytes")

@@ -13,11 +13,12 @@ from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.message import can_frame
 from thermoctl_hal.base.profile import Assumed, Dbc, DbcSource, Message, typed
 from thermoctl_hal.base.wire import EXTENDED
-from thermoctl_hal.can.bus import AnyPort, open_can
+from thermoctl_hal.can.bus import BY_PGN, AnyPort, open_can, pgn_of
 
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Message as DbcMessage
 
+_Entry = tuple["DbcMessage", list[tuple[int, DbcSource]], list[str]]
 CLASSIC_BYTES = 8  # of a frame that is not CAN FD
 
 
@@ -28,9 +29,12 @@ class DbcDevice(Device):
         super().__init__(binding)
         spec = self._spec = typed(binding.profile.bus_spec, Dbc)
         self._port: AnyPort | None = None
-        self._messages: dict[int, tuple[DbcMessage, list[tuple[int, DbcSource]], list[str]]] = {}
-        """CAN id -> the message, its bound channels, the names of signals that say whether they are good."""
+        self._messages: dict[int, _Entry] = {}
+        """CAN id, or parameter group of J1939 -> the message, its bound channels, and the names of signals
+        whose raw numbers say whether they are good."""
+        self._sender: dict[int, int] = {}  # parameter group -> the source address that it is taken from
         self._fd_ignored = 0
+        self._others: set[int] = set()  # source addresses of J1939 whose messages were not taken
         self._quiet, self._why = 0, ""  # frames since the last reading, and why the last of them gave none
         for i, b in enumerate(binding.bounds):
             if isinstance(b.channel.source, Assumed):
@@ -38,10 +42,14 @@ class DbcDevice(Device):
             source = typed(b.channel.source, DbcSource)
             message = spec.database.get_message_by_name(source.message)
             can_id = spec.can_id(source.message, binding.address)
+            if spec.is_j1939(source.message):
+                can_id = pgn_of(can_id)
             entry = self._messages.setdefault(can_id, (message, [], []))
             entry[1].append((i, source))
             if source.invalid is not None:
                 entry[2].append(source.invalid.field)
+            if source.sentinels:
+                entry[2].append(source.signal)
 
     def connect(self) -> None:
         """Open the port."""
@@ -62,37 +70,57 @@ class DbcDevice(Device):
         for can_id, data in port.receive():
             self._take(sample, can_id, data, now_s)
         for can_id, data in port.long_frames():
-            entry = self._messages.get(can_id)
+            entry = self._entry(can_id)
             if entry is not None and (entry[0].is_fd or entry[0].length > CLASSIC_BYTES):
                 self._take(sample, can_id, data, now_s)
             else:
                 self._fd_ignored += 1
 
+    def _entry(self, can_id: int) -> _Entry | None:
+        """Return the message of an identifier, or of its parameter group from one sender, the first one.
+
+        A second sender of the group is another device: the binding's `address` chooses."""
+        entry = self._messages.get(can_id)
+        group = pgn_of(can_id)
+        if entry is not None or group not in self._messages:
+            return entry
+        address = can_id & 0xFF
+        if address == (self.binding.address or self._sender.setdefault(group, address)):
+            return self._messages[group]
+        self._others.add(address)
+        return None
+
     def _take(self, sample: Sample, can_id: int, data: bytes, now_s: float) -> None:
         """Store the readings of a frame."""
-        entry = self._messages.get(can_id)
+        entry = self._entry(can_id)
         if entry is None:
             self._quiet += 1
-            if can_id ^ EXTENDED in self._messages:
+            if self._others:
+                wanted = ", ".join(str(a) for a in sorted(self._others))
+                self._why = f"source addresses {wanted} send it, too: give the wanted one as 'address'"
+            elif can_id ^ EXTENDED in self._messages:
                 here, there = (29, 11) if can_id & EXTENDED else (11, 29)
                 self._why = f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
             return
         try:
-            values: Mapping[str, Any] = entry[0].decode_simple(data, decode_choices=False, scaling=True)
+            values: Mapping[str, Any] = entry[0].decode_simple(data, False, True, True)
             readings = [(i, s, float(values[s.signal])) for i, s in entry[1] if s.signal in values]
-            raws: Mapping[str, Any] = (
-                entry[0].decode_simple(data, decode_choices=False, scaling=False) if entry[2] else {}
-            )
+            raws: Mapping[str, Any] = entry[0].decode_simple(data, False, False, True) if entry[2] else {}
         except Exception as e:  # foreign bytes may raise anything in the library
             self.counts["errors"] += 1
             self._quiet += 1
             self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
             return
         self.counts["frames"] += 1
+        if not readings and len(data) < entry[0].length:
+            self._quiet += 1
+            self._why = (
+                f"{entry[0].name} came with {len(data)} of {entry[0].length} bytes, without the signal"
+            )
         for i, source, value in readings:
             self._quiet, self._why = 0, ""
             test = source.invalid
-            if value in source.sentinels:
+            if raws.get(source.signal) in source.sentinels:
                 self.fail(sample, i, f"{source.signal} is {value:g}: no reading")
             elif test is not None and int(raws.get(test.field, test.value)) & test.mask != test.value:
                 self.fail(
@@ -103,7 +131,7 @@ class DbcDevice(Device):
 
     def silence(self) -> str:
         """Say what arrives instead of a reading."""
-        wanted = ", ".join(f"0x{i & ~EXTENDED:X} ({29 if i & EXTENDED else 11} bits)" for i in self._messages)
+        wanted = ", ".join(map(_shown, self._messages))
         if self._quiet:
             return f"{self._quiet} frames came and gave no reading: {self._why or f'none is {wanted}'}"
         ignored = self.counters().get("ignored", 0)
@@ -116,6 +144,13 @@ class DbcDevice(Device):
         if self._port is not None:
             self.counts["ignored"] = self._port.ignored + self._fd_ignored
         return self.counts
+
+
+def _shown(can_id: int) -> str:
+    """Return an identifier or a parameter group for messages."""
+    if can_id & BY_PGN:
+        return f"PGN {can_id & ~BY_PGN} of J1939"
+    return f"0x{can_id & ~EXTENDED:X} ({29 if can_id & EXTENDED else 11} bits)"
 
 
 class DbcDrive(Commanded, DbcDevice):

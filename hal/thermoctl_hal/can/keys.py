@@ -22,7 +22,13 @@ CAN: dict[str, tuple[Key, ...]] = {
         Key("message", "text", "message of the DBC file"),
         Key("signal", "text", "signal of that message; a multiplexed one counts only when it is sent"),
         Key("invalid", "section", "a signal of the same message that says that the reading is wrong", None),
-        Key("sentinels", "list", "values of the signal that mean 'no reading'", None, example="[3276.7]"),
+        Key(
+            "sentinels",
+            "list",
+            "values of the signal (or its raw numbers) that mean 'no reading'; compared as raw numbers; 0x.. are its bits",
+            None,
+            example="[3276.7]",
+        ),
     ),
     "invalid of can-dbc": (
         Key("signal", "text", "the signal"),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from thermoctl.yamlfile import Node, Section, integer_of, kind_of, number_of
-from thermoctl_hal.base.key import named, take
+from thermoctl_hal.base.key import named, sentinel_of, take
 from thermoctl_hal.base.profile import (
     ERROR_CODE,
     FIELD_TYPES,
@@ -20,43 +21,87 @@ from thermoctl_hal.base.profile import (
     object_name,
     typed,
 )
+from thermoctl_hal.can.dbc_file import load_dbc
 from thermoctl_hal.can.keys import CAN
 
+if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can import Signal
+
 MAX_SUB_INDEX = 255
+NEAR_RAW = 0.01  # a value is that of a raw number when it lies so close to it, in steps
 OBJECT_TYPES = {t: c for t, c in FIELD_TYPES.items() if t[-2:] != "64" and not t.startswith("float")}
 
 
 def read_dbc(top: Section, folder: Path) -> Dbc:
     """Read the DBC file of a can-dbc device."""
-    import cantools  # takes a second; only DBC profiles need it
-
     k = take(top, CAN["can-dbc"])
     path = folder / str(k["dbc"])
     node = top.get("dbc")
     try:
-        database = cantools.database.load_file(str(path), database_format="dbc")
+        found = load_dbc(path)
     except OSError as e:
         raise node.error(f"dbc: {path} cannot be read: {e.strerror}") from None
-    except Exception as e:  # cantools raises parse errors of several libraries
-        reason = (str(e).splitlines() or [type(e).__name__])[0]
-        raise node.error(f"dbc: {path} is not a DBC file: {reason}") from None
+    except ValueError as e:
+        raise node.error(f"dbc: {path} is not a DBC file: {e}") from None
     shift = -1 if k["node_shift"] is None else k["node_shift"]
-    return Dbc(path, typed(database, cantools.database.can.Database), shift)
+    return Dbc(path, found.database, shift, found.faults, found.warning)
 
 
 def read_signal(s: Section, spec: BusSpec) -> DbcSource:
     """Read the place of a channel of a can-dbc device: message and signal."""
-    database = typed(spec, Dbc).database
+    dbc = typed(spec, Dbc)
     k = take(s, CAN["channel of can-dbc"])
-    message = named(s, "message", [m.name for m in database.messages])
-    signals = [x.name for x in database.get_message_by_name(message).signals]
+    message = message_of(s, dbc)
     invalid = None
     if k["invalid"] is not None:
         i = take(k["invalid"], CAN["invalid of can-dbc"])
-        invalid = Condition(named(k["invalid"], "signal", signals), i["mask"] or -1, i["good"])
+        test = _signal_of(k["invalid"], dbc, message)
+        invalid = Condition(test.name, i["mask"] or -1, i["good"])
         k["invalid"].end()
-    sentinels = tuple(number_of(n, "sentinels") for n in k["sentinels"] or ())
-    return DbcSource(message, named(s, "signal", signals), invalid, sentinels)
+    signal = _signal_of(s, dbc, message)
+    sentinels = tuple(_raw_sentinel(n, signal) for n in k["sentinels"] or ())
+    return DbcSource(message, signal.name, invalid, sentinels)
+
+
+def message_of(s: Section, spec: Dbc) -> str:
+    """Return the message that `message` names. Raises InputError where the DBC file has no such sound one."""
+    name = s.text("message")
+    if name in spec.faults:
+        raise s.get("message").error(f"message: {spec.file}: {spec.faults[name]}")
+    return named(s, "message", [m.name for m in spec.database.messages])
+
+
+def _signal_of(s: Section, spec: Dbc, message: str) -> Signal:
+    """Return the signal that `signal` names. Raises InputError where the message has no such sound one."""
+    fault = spec.faults.get(f"{message}.{s.text('signal')}")
+    if fault is not None:
+        raise s.get("signal").error(f"signal: {spec.file}: {fault}")
+    found = spec.database.get_message_by_name(message)
+    return found.get_signal_by_name(named(s, "signal", [x.name for x in found.signals]))
+
+
+def _raw_sentinel(node: Node, signal: Signal) -> float:
+    """Return the raw number of a sentinel: a value of the signal, or a raw number that is no such value.
+
+    Raises InputError where the signal can hold neither."""
+    value = number_of(node, "sentinels")
+    if isinstance(node.value, str):  # hexadecimal: the bits of the raw number
+        letter = {32: "f", 64: "d"}[signal.length] if signal.is_float else ""
+        return sentinel_of(node, signal.length, signal.is_signed, letter)
+    if signal.is_float:
+        return float((value - signal.offset) / signal.scale)
+    bits = signal.length
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    exact = (value - signal.offset) / signal.scale
+    for raw in (exact, value):
+        nearest = round(raw)
+        if low <= nearest <= high and abs(raw - nearest) < NEAR_RAW:
+            return float(nearest)
+    first, last = sorted(x * signal.scale + signal.offset for x in (low, high))
+    raise node.error(
+        f"sentinels: {value:g} cannot come: {signal.name} has {bits} bits, values {first:g} .. {last:g} in steps "
+        f"of {abs(signal.scale):g}, raw numbers {low} .. {high}"
+    )
 
 
 def read_cia402(top: Section, folder: Path) -> Cia402:

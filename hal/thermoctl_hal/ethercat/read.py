@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.yamlfile import Node, Section, number_of
-from thermoctl_hal.base.key import take
+from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     FIELD_TYPES,
     STATUS_WORD,
@@ -171,9 +171,16 @@ def read_place(s: Section, spec: BusSpec) -> Place:
         found.letter,
         (k["low_bit"], k["bits"]),
         k["signed"],
-        tuple(number_of(n, "sentinels") for n in k["sentinels"] or ()),
+        tuple(_sentinel(n, found, k) for n in k["sentinels"] or ()),
         invalid,
     )
+
+
+def _sentinel(node: Node, found: Place, k: dict[str, Any]) -> float:
+    if k["bits"]:
+        return sentinel_of(node, k["bits"], k["signed"])
+    width = 8 * (found.end - found.offset)
+    return sentinel_of(node, width, found.letter.islower(), found.letter if found.letter in "fd" else "")
 
 
 def _place(s: Section, k: dict[str, Any], spec: Ethercat) -> Place:

@@ -12,13 +12,15 @@ from pathlib import Path
 
 from thermoctl.rig.channels import DEFAULT, AxesChannels, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
-from thermoctl_hal.base.binding import Binding, Bound, port_key
-from thermoctl_hal.base.profile import BinaryFrame, Cia402, Profile, Register, TextLine
+from thermoctl_hal.base.binding import Binding, Bound, limits_of, port_key
+from thermoctl_hal.base.profile import BinaryFrame, Cia402, Dbc, Modbus, Profile, Register, TextLine
 from thermoctl_hal.base.units import role_units
+from thermoctl_hal.can.eds import read_eds
 from thermoctl_hal.ethercat.read import LONGEST_WATCHDOG_S, Ethercat
 from thermoctl_hal.modbus.read import register_hint
 from thermoctl_hal.profiles.read import load_profile
 
+LAST_ON_A_LINE, LAST_ON_TCP = 247, 255  # units of Modbus; a gateway's own is 255
 FREE = ("socketcan", "virtual", "udp_multicast")
 """CAN interfaces that any number of devices may open."""
 
@@ -60,7 +62,11 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
         if (watchdog := s.number("watchdog_s", 0.0, 1e-3, LONGEST_WATCHDOG_S)) > 0.0:
             profile = replace(profile, bus_spec=replace(spec, watchdog_s=watchdog))
     else:
-        address = s.integer("address", spec.address, 0, 247)
+        port_text = s.text("port")
+        far = isinstance(spec, Dbc) or (isinstance(spec, Modbus) and port_text.startswith("tcp:"))
+        address = s.integer("address", spec.address, 0, LAST_ON_TCP if far else LAST_ON_A_LINE)
+        if address > LAST_ON_A_LINE and not far:
+            raise s.node.error(f"address: {address} is outside 0 .. {LAST_ON_A_LINE} of a serial line")
         for key in ("watchdog_s", "master_id"):
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")
@@ -117,13 +123,14 @@ def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound
             f"{' or '.join(units)}"
         )
     factor, shift = units[channel.unit]
+    low, high = limits_of(channel)
     return Bound(
         role.value,
         channel,
         channel.scale * factor,
         channel.offset * factor + shift,
-        channel.range[0] * factor + shift,
-        channel.range[1] * factor + shift,
+        low * factor + shift,
+        high * factor + shift,
     )
 
 
@@ -193,6 +200,19 @@ def _check_can_bus(first: Binding, second: Binding, both: str) -> None:
             raise InputError(f"{both}, and both have node id {first.address}: give each its own 'address'")
         if one.master_id == other.master_id:
             raise InputError(f"{both}, and both have master_id {one.master_id}: give each its own")
+
+
+def file_warnings(bindings: Iterable[Binding]) -> list[str]:
+    """Return a line for each DBC or EDS file that was read in spite of a fault."""
+    found = []
+    for b in bindings:
+        spec = b.profile.bus_spec
+        warning = spec.warning if isinstance(spec, Dbc) else ""
+        if isinstance(spec, Cia402) and spec.eds is not None:
+            warning = read_eds(spec.eds).warning
+        if warning and warning not in found:
+            found.append(warning)
+    return found
 
 
 def rig_notes(bindings: Iterable[Binding]) -> list[str]:

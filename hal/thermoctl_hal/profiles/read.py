@@ -74,7 +74,8 @@ def _check_dbc_unit(s: Section, spec: Dbc, channel: Channel) -> None:
     source = typed(channel.source, DbcSource)
     signal = spec.database.get_message_by_name(source.message).get_signal_by_name(source.signal)
     theirs = dbc_unit(signal.unit)
-    if theirs != channel.unit and abs(channel.scale) == 1.0 and is_convertible(theirs):
+    kelvin = {theirs, channel.unit} == {"degC", "K"} and abs(channel.offset) > 0.0
+    if theirs != channel.unit and abs(channel.scale) == 1.0 and is_convertible(theirs) and not kelvin:
         raise s.get("unit").error(
             f"unit: the DBC file gives {signal.name} in {signal.unit}, the profile says {channel.unit} "
             f"with scale 1; say unit: {theirs}, or the scale from {signal.unit} to {channel.unit}"

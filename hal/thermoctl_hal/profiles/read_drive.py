@@ -28,6 +28,7 @@ from thermoctl_hal.base.profile import (
     TextMessage,
     object_name,
 )
+from thermoctl_hal.can.read import message_of
 from thermoctl_hal.ethercat.read import Ethercat
 from thermoctl_hal.profiles.keys import TABLES
 from thermoctl_hal.serial.read import bytes_of, checksum_name
@@ -150,7 +151,7 @@ def read_message(node: Node, spec: BusSpec, key: str) -> Message:
     s = Section(node, key)
     if isinstance(spec, Dbc):
         k = take(s, TABLES["message of can-dbc"])
-        message_name = named(s, "message", [m.name for m in spec.database.messages])
+        message_name = message_of(s, spec)
         signals = [x.name for x in spec.database.get_message_by_name(message_name).signals]
         values = {}
         if k["values"] is not None:

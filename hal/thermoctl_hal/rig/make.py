@@ -11,7 +11,7 @@ from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.buses import BUSES, part
-from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
+from thermoctl_hal.profiles.bind import bind, check_rig, file_warnings, rig_notes
 from thermoctl_hal.rig.axes import AxisBackend
 from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.devices import DevicesBackend
@@ -116,6 +116,23 @@ def _bindings(settings: Settings) -> list[Binding]:
 def device_notes(settings: Settings) -> list[str]:
     """Return a line for each probable mistake in `hal.devices`. Raises InputError."""
     return rig_notes(_bindings(settings))
+
+
+def device_warnings(settings: Settings) -> list[str]:
+    """Return a line for each file of a device that was read in spite of a fault. Raises InputError."""
+    return file_warnings(_bindings(settings)) if settings.hal.backend == "devices" else []
+
+
+def whole_frames(settings: Settings) -> dict[str, str]:
+    """Return role -> device, for devices of which each frame (or line) has every channel."""
+    return {
+        x.role: b.name
+        for b in _bindings(settings)
+        if b.profile.bus in ("serial-binary", "serial-lines", "can-cia402")
+        or len({getattr(x.channel.source, "message", x.role) for x in b.bounds}) == 1
+        and b.profile.bus == "can-dbc"
+        for x in b.bounds
+    }
 
 
 def driving_devices(settings: Settings) -> list[Device]:

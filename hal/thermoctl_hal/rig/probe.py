@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, ROLES, HardwareError, Sample
-from thermoctl_hal.base.binding import Binding, Bound
+from thermoctl_hal.base.binding import Binding, Bound, limits_of
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Object, Profile, typed
 from thermoctl_hal.base.wire import EXTENDED, read_available
@@ -45,7 +45,7 @@ class Probe:
         self.profile = replace(profile, amplifier=None)
         channels = [c for c in profile.channels.values() if not isinstance(c.source, Assumed)]
         bounds = [
-            Bound(role, c, c.scale, c.offset, *c.range)
+            Bound(role, c, c.scale, c.offset, *limits_of(c))
             for role, c in zip(ROLES, channels[: len(ROLES)], strict=False)
         ]
         spec = profile.bus_spec

@@ -7,6 +7,7 @@ them.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import sys
@@ -35,7 +36,14 @@ from thermoctl.recording.writer import disk_warning
 from thermoctl.rig.channels import AMPLIFIER_STATES
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
-from thermoctl_hal.rig.make import device_notes, fast_devices, make_backend, make_backends
+from thermoctl_hal.rig.make import (
+    device_notes,
+    device_warnings,
+    fast_devices,
+    make_backend,
+    make_backends,
+    whole_frames,
+)
 from thermoctl_hal.serial.latency_timer import latency_timer_ms
 
 
@@ -64,7 +72,8 @@ def _check(settings: Settings) -> int:
                 *filter(None, (origin(settings), unknown_group(settings))),
             ]
         found = list(obstacles(settings))
-        found += [(False, w) for w in (power_warning(settings), priority_warning(settings)) if w]
+        warnings = power_warning(settings), priority_warning(settings), *device_warnings(settings)
+        found += [(False, w) for w in warnings if w]
     for in_the_way, line in found:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
     bad = any(in_the_way for in_the_way, _ in found)
@@ -106,10 +115,11 @@ def _each_axis(settings: Settings, examine: Callable[[Settings], int]) -> int:
 
 @dataclass
 class _Readings:
-    """Number of reads, new readings of each role, and the last sample."""
+    """Number of reads, new readings of each role, frames of each device's counter, and the last sample."""
 
     reads: int
     counts: dict[str, int]
+    frames: dict[str, int]
     sample: Sample
 
 
@@ -152,6 +162,7 @@ def doctor(settings: Settings, seconds: float = 2.0) -> int:
 def _read_for(backend: Backend, seconds: float, period_s: float, roles: tuple[str, ...]) -> _Readings:
     """Read every period for `seconds`, with the amplifier disabled."""
     counts, reads = dict.fromkeys(roles, 0), 0
+    before = dict(backend.counters())
     begin = now = time.monotonic()
     while not reads or now < begin + seconds:
         sample = backend.read(now)
@@ -161,12 +172,14 @@ def _read_for(backend: Backend, seconds: float, period_s: float, roles: tuple[st
         backend.write(0.0, False)  # a drive sends readings after each SYNC; it stays disabled
         time.sleep(period_s)
         now = time.monotonic()
-    return _Readings(reads, counts, sample)
+    frames = {name: count - before.get(name, 0) for name, count in backend.counters().items()}
+    return _Readings(reads, counts, frames, sample)
 
 
 def _print_channels(settings: Settings, backend: Backend, found: _Readings, seconds: float) -> int:
     """Print one line a channel; return how many are bad."""
     expected, sample, bad = expected_hz(settings), found.sample, 0
+    framed = whole_frames(settings) if expected else {}
     print(f"{'channel':24}{'value':>14} {'unit':8}{'status':8}{'rate':>10}")
     for k, channel in enumerate(settings.channels.table):
         role = channel.role
@@ -174,10 +187,14 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
         if state == "ABSENT" and role not in settings.protection.required:
             continue
         bad += sample.status[k] != OK
-        rate_hz = found.counts[role] / seconds
-        problem = backend.problem(role) or slow(role, rate_hz, expected, found.reads / seconds)
+        count, most_hz = found.counts[role], found.reads / seconds
+        if (name := framed.get(role)) is not None and f"{name}.frames" in found.frames:
+            count, most_hz = max(count, found.frames[f"{name}.frames"]), math.inf
+        rate_hz = count / seconds
+        problem = backend.problem(role) or slow(role, rate_hz, expected, most_hz)
+        of = f" of {expected[role]:g}" if role in expected else ""
         print(
-            f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f} Hz"
+            f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f}{of} Hz"
             + (f"   {problem or _in_words(role, sample.value[k])}".rstrip())
         )
     if counters := backend.counters():

@@ -1,0 +1,28 @@
+"""Text of files that other programs wrote (DBC, EDS), in the encodings that they use."""
+
+from __future__ import annotations
+
+import codecs
+from pathlib import Path
+
+_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+
+
+def read_text(path: Path) -> str:
+    """Return a file's text: by its byte order mark, else UTF-8, UTF-16 without a mark, else cp1252.
+
+    Lines end with \\n. Bytes that the encoding does not know become U+FFFD. Raises OSError."""
+    data = path.read_bytes()
+    return _decoded(data).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _decoded(data: bytes) -> str:
+    for mark, encoding in _MARKS:
+        if data.startswith(mark):
+            return data.decode(encoding, "replace")
+    if data[1:2] == b"\0" or data[:1] == b"\0":  # the first character is ASCII in both formats
+        return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be", "replace")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")

@@ -1,0 +1,270 @@
+"""Read a DBC file so that only the messages that a profile names must be sound.
+
+cantools reads the file as it is. Where it refuses, each message is read alone from its BO_, SG_,
+SIG_VALTYPE_ and SG_MUL_VAL_ lines and the attribute VFrameFormat. Other lines have no effect on readings.
+One warning names the parts that were mended or left out. A part that cannot be used is refused only when a
+profile names it.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from thermoctl_hal.base.text_file import read_text
+
+if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can import Database, Message
+
+EXTENDED, LONGEST_11, LONGEST_29 = 0x8000_0000, 0x7FF, 0x1FFF_FFFF
+NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"  # holds the signals that no message has
+_BLOCK = re.compile(r"\s*BO_\s+(\d+)\s+([^\s:]+)\s*:\s*(\d+)\s*(\S*)")
+_SIGNAL = re.compile(
+    r"\s*SG_\s+(?P<name>\S+?)\s*(?P<mux>\b[mM]\d*M?)?\s*:\s*(?P<place>\d+\s*\|\s*\d+\s*@\s*[01]\s*[+-])\s*"
+    r'\((?P<scale>[^)]*)\)\s*\[[^\]]*\]\s*"(?P<unit>[^"]*)"'
+)
+_BEGINS_SIGNAL = re.compile(r"\s*SG_\s+([^\s:]+)")
+_NAME = re.compile(r"[A-Za-z_]\w*")
+_NUMBER = re.compile(r"[+-]?(?:\d+[.]?\d*|[.]\d+)(?:[eE][+-]?\d+)?")
+_PLAIN = re.compile(r"\s*[+-]?\d[^,;]*,\s*[+-]?\d[^,;]*")  # as the format has it
+_TYPE = re.compile(r"\s*SIG_VALTYPE_\s+(\d+)\s+(\S+?)\s*:?\s*([0-3])\s*;")
+_EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
+_FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
+_FORMAT_OF = re.compile(r'\s*BA_\s+"VFrameFormat"\s+BO_\s+(\d+)\s+([^;]*);')
+_WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
+_LINE = re.compile(r"at line (\d+)")
+
+
+@dataclass(frozen=True)
+class DbcFile:
+    """Messages of a DBC file. `faults`: MESSAGE or MESSAGE.SIGNAL -> why a profile cannot use it.
+
+    `warning`: file, line and message of the first part that was mended or left out; '' without any."""
+
+    database: Database
+    faults: Mapping[str, str] = field(default_factory=dict)
+    warning: str = ""
+
+
+@dataclass
+class _Block:
+    """A message's lines: number and text; the first one is its BO_ line."""
+
+    lines: list[tuple[int, str]]
+    number: int
+    name: str
+    length: str
+    more: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """A signal's line, its name, the name under which cantools can parse it, and its canonical text."""
+
+    line: int
+    name: str
+    safe: str
+    text: str
+
+
+def load_dbc(path: Path) -> DbcFile:
+    """Read a DBC file. Raises OSError; ValueError where no message can be read."""
+    from cantools.database import load_string
+
+    text = read_text(path)
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # it warns of names that are defined twice
+    try:
+        database: Any = load_string(text, database_format="dbc")
+        reason = ""
+    except Exception as e:  # cantools raises parse errors of several libraries
+        database, reason = None, _first_line(e)
+    if database is None:
+        return _by_message(path, text, reason)
+    return DbcFile(database, _doubled(m for m in database.messages))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].removeprefix("DBC: ").strip('"')
+
+
+def _doubled(messages: Iterator[Message]) -> dict[str, str]:
+    """Return the names that several messages have."""
+    names = defaultdict(list)
+    for m in messages:
+        names[m.name].append(f"0x{m.frame_id:X}")
+    return {
+        n: f"{len(ids)} messages have this name ({', '.join(ids)}): give each a name of its own in the DBC file"
+        for n, ids in names.items()
+        if len(ids) > 1
+    }
+
+
+def _by_message(path: Path, text: str, reason: str) -> DbcFile:
+    from cantools.database.can import Database
+
+    blocks, attributes, remarks = _blocks(text)
+    if not blocks:
+        raise ValueError(reason)
+    messages: list[Message] = []
+    faults: dict[str, str] = {}
+    for block in blocks:
+        message = _message(block, attributes, faults, remarks)
+        if message is not None:
+            messages.append(message)
+    faults |= _doubled(iter(messages))
+    if not remarks:
+        line = _LINE.search(reason)
+        remarks.append((int(line[1]) if line else 1, f"{reason}: not needed for readings"))
+    remarks.sort()
+    more = f"; and {len(remarks) - 1} more" if len(remarks) > 1 else ""
+    return DbcFile(Database(messages, strict=False), faults, f"{path}:{remarks[0][0]}: {remarks[0][1]}{more}")
+
+
+def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
+    """Return the messages' blocks, the lines that declare VFrameFormat, and remarks on the rest."""
+    blocks: list[_Block] = []
+    attributes: list[str] = []
+    remarks: list[tuple[int, str]] = []
+    signals: set[tuple[int, str]] = set()
+    of: dict[int, list[_Block]] = defaultdict(list)
+    for number, line in enumerate(text.split("\n"), 1):
+        found = _BLOCK.match(line)
+        if found and found[2] != NO_MESSAGE:
+            blocks.append(_Block([(number, line)], int(found[1]), found[2], found[3]))
+            of[int(found[1])].append(blocks[-1])
+        elif (begin := _BEGINS_SIGNAL.match(line)) and blocks:
+            blocks[-1].lines.append((number, line))
+            signals.add((blocks[-1].number, begin[1]))
+        elif (begin := _WORDS_OF.match(line)) and (int(begin[1]), begin[2]) not in signals:
+            remarks.append((number, f"VAL_ {begin[1]} {begin[2]}: there is no such signal, ignored"))
+        elif _FORMAT.match(line):
+            attributes.append(line.strip())
+        else:
+            for pattern in (_TYPE, _EXTENDED_MUX, _FORMAT_OF):
+                if found := pattern.match(line):
+                    for block in of[int(found[1])]:
+                        block.more.append(line.strip())
+    return blocks, attributes, remarks
+
+
+def _message(
+    block: _Block, attributes: list[str], faults: dict[str, str], remarks: list[tuple[int, str]]
+) -> Message | None:
+    """Read a message alone; add mended and ignored parts to `remarks`, unusable ones to `faults`."""
+    line, number = block.lines[0][0], block.number
+    if LONGEST_11 < number < EXTENDED:
+        number |= EXTENDED
+        remarks.append((line, f"{block.name}: identifier 0x{block.number:X} without bit 31, read as 29 bits"))
+    if number & ~EXTENDED > LONGEST_29:
+        _left_out(line, block.name, f"identifier 0x{number:X} has more than 29 bits", faults, remarks)
+        return None
+    signals = _signals(block, faults, remarks)
+    safe_name = block.name if _NAME.fullmatch(block.name) else "X_"
+    if safe_name != block.name:
+        remarks.append((line, f"{block.name}: not a name of the DBC format"))
+
+    def parsed(*chosen: _Signal) -> tuple[Message | None, str]:
+        """Return the message with these signals, and what is wrong with it."""
+        return _parsed(block, number, safe_name, chosen, attributes)
+
+    message, why = parsed(*signals)
+    if message is None:  # for one of its signals: leave out each that does not stand alone
+        for signal in list(signals):
+            alone, fault = parsed(signal)
+            if alone is None:
+                _left_out(signal.line, f"{block.name}.{signal.name}", fault, faults, remarks)
+                signals.remove(signal)
+        message, why = parsed(*signals)
+    if message is None:
+        _left_out(line, block.name, why, faults, remarks)
+        return None
+    if why:
+        remarks.append((line, f"{block.name}: {why}"))
+    return message
+
+
+def _left_out(line: int, name: str, why: str, faults: dict[str, str], remarks: list[tuple[int, str]]) -> None:
+    """Note a message or signal that cannot be used."""
+    faults[name] = f"line {line}: {why}"
+    remarks.append((line, f"{name}: {why}"))
+
+
+def _signals(block: _Block, faults: dict[str, str], remarks: list[tuple[int, str]]) -> list[_Signal]:
+    """Return the signals of a message whose lines can be read."""
+    signals: dict[str, _Signal] = {}
+    for line, text in block.lines[1:]:
+        found, begin = _SIGNAL.match(text), _BEGINS_SIGNAL.match(text)
+        name = found["name"] if found else begin[1] if begin else text
+        scale = _scale(found["scale"]) if found else ""
+        if name in signals:
+            _left_out(line, f"{block.name}.{name}", "a second signal of this name", faults, remarks)
+        elif found is None or not scale:
+            why = f"no signal of the format: {text.strip()[:60]}"
+            _left_out(line, f"{block.name}.{name}", why, faults, remarks)
+        else:
+            safe = name if _NAME.fullmatch(name) else f"X_{len(signals)}_"
+            if safe != name:
+                remarks.append((line, f"{block.name}.{name}: not a name of the DBC format"))
+            if not _PLAIN.fullmatch(found["scale"]):
+                remarks.append(
+                    (line, f"{block.name}.{name}: odd numbers ({found['scale']}), read as {scale}")
+                )
+            mux, place, unit = found["mux"] or "", found["place"], found["unit"]
+            canonical = f' SG_ {safe} {mux} : {place} {scale} [0|0] "{unit}" Vector__XXX'
+            signals[name] = _Signal(line, name, safe, canonical)
+    return list(signals.values())
+
+
+def _scale(text: str) -> str:
+    """Return '(factor,offset)' in the format's notation; '' where it is none. Decimal commas are read."""
+    parts = [p.strip() for p in re.split(r"[,;]", text)]
+    if len(parts) == 4:  # a decimal comma in both numbers
+        parts = [f"{parts[0]}.{parts[1]}", f"{parts[2]}.{parts[3]}"]
+    if len(parts) != 2 or not all(_NUMBER.fullmatch(p) for p in parts):
+        return ""
+    return f"({float(parts[0])!r},{float(parts[1])!r})"
+
+
+def _parsed(
+    block: _Block, number: int, name: str, signals: Sequence[_Signal], attributes: list[str]
+) -> tuple[Message | None, str]:
+    """Return the message by cantools and what its strict reading says against it; None where it has none."""
+    from cantools.database import load_string
+
+    back = {s.name: s.safe for s in signals}
+    more = [re.sub(r"^(\S+\s+(?:BO_\s+)?)\d+", rf"\g<1>{number}", m) for m in block.more if "BA_" not in m]
+    more += [
+        re.sub(r"BO_\s+\d+", f"BO_ {number}", m) for m in block.more if m.startswith("BA_") and attributes
+    ]
+    more = [" ".join(back.get(word, word) for word in m.split(" ")) for m in more]
+    more = [m for m in more if m.startswith("BA_") or m.split()[2].rstrip(":") in back.values()]
+    head = [f"BO_ {number} {name}: {block.length} Vector__XXX", *(s.text for s in signals), ""]
+    text = "\n".join(['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_:", "", *head, *attributes, *more, ""])
+    why = ""
+    for strict in (True, False):
+        try:
+            database: Any = load_string(text, database_format="dbc", strict=strict)
+        except Exception as e:  # cantools raises parse errors of several libraries
+            why = why or _first_line(e)
+            continue
+        message: Message = database.messages[0]
+        _rename(message, block.name, {s.safe: s.name for s in signals if s.safe != s.name})
+        return message, why
+    return None, why
+
+
+def _rename(message: Message, name: str, names: Mapping[str, str]) -> None:
+    """Give a message and its signals the names that they have in the file."""
+    if message.name != name:
+        message.name = name
+    if names:
+        for signal in message.signals:
+            signal.name = names.get(signal.name, signal.name)
+            if signal.multiplexer_signal is not None:
+                signal.multiplexer_signal = names.get(signal.multiplexer_signal, signal.multiplexer_signal)
+        message.refresh(strict=False)

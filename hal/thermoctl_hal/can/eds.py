@@ -1,0 +1,130 @@
+"""Read the types of objects from an EDS file (CiA 306); only those that a profile names must be sound.
+
+Of each section `[6041]` or `[1A00sub3]` only ParameterName, ObjectType and DataType count. Other lines, and
+faults in them, are passed over with one warning.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from thermoctl_hal.base.profile import Object, object_name
+from thermoctl_hal.base.text_file import read_text
+
+_SECTION = re.compile(r"\s*\[\s*([^\]]*?)\s*\]")
+_OBJECT = re.compile(r"(?:0x)?([0-9A-F]{4})(?:\s*sub\s*(?:0x)?([0-9A-F]{1,2}))?", re.IGNORECASE)
+_NUMBER = re.compile(r"(?:0x([0-9A-F]+)|([0-9A-F]+)h|(\d+))", re.IGNORECASE)
+_COMMENT = (";", "#", "//")
+_VARIABLE = 0x7  # ObjectType; a missing one is a variable
+LAST_SUB = 254
+
+
+@dataclass
+class Entry:
+    """A section of the file: its line, and the keys that count, by lower-case name."""
+
+    line: int
+    again: Entry | None = None  # a second section of this object with another type
+    keys: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Return the object's name."""
+        return self.keys.get("parametername", "")
+
+    @property
+    def data_type(self) -> int | None:
+        """Return the number of the data type; None where there is none."""
+        return _number(self.keys.get("datatype", ""))
+
+
+@dataclass(frozen=True)
+class Eds:
+    """The objects of an EDS file. `warning`: file, line and object of the first oddity; '' without any."""
+
+    entries: dict[Object, Entry]
+    warning: str
+
+    def subs(self, index: int) -> list[int]:
+        """Return the sub-indices above 0 of an object."""
+        return sorted(o.sub for o in self.entries if o.number == index and o.sub)
+
+    def has(self, index: int) -> bool:
+        """Return whether the file has an object of this index."""
+        return any(o.number == index for o in self.entries)
+
+
+def _number(text: str) -> int | None:
+    """Return a number as EDS files write it: 7, 0x0007, 0007h; None for other text."""
+    found = _NUMBER.fullmatch(text.split(";")[0].strip())
+    if found is None:
+        return None
+    return int(found[1] or found[2] or found[3], 10 if found[3] else 16)
+
+
+def read_eds(path: Path) -> Eds:
+    """Read an EDS file. Raises OSError; ValueError where it has no object."""
+    entries, remarks = _sections(read_text(path).split("\n"))
+    if not entries:
+        raise ValueError("it has no section of an object, as [6041]")
+    _add_compact(entries)
+    remarks += _odd(entries)
+    remarks.sort()
+    more = f"; and {len(remarks) - 1} more" if len(remarks) > 1 else ""
+    return Eds(entries, f"{path}:{remarks[0][0]}: {remarks[0][1]}{more}" if remarks else "")
+
+
+def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, str]]]:
+    """Return the objects' sections, and what was passed over: line and words."""
+    entries: dict[Object, Entry] = {}
+    remarks: list[tuple[int, str]] = []
+    counts: dict[int, int] = {}  # index -> line of its sub-index 0
+    entry: Entry | None = None
+    for number, line in enumerate(lines, 1):
+        text = line.strip().strip("\ufeff\0")
+        if not text or text.startswith(_COMMENT):
+            if text.startswith("//"):
+                remarks.append((number, f"'{text[:40]}' is no comment of the format, passed over"))
+            continue
+        if section := _SECTION.match(text):
+            found = _OBJECT.fullmatch(section[1])
+            entry = Entry(number) if found else None
+            if found and entry:
+                item = Object(int(found[1], 16), int(found[2] or "0", 16))
+                if found[2] and not item.sub:
+                    counts.setdefault(item.number, number)  # [2022sub0] counts the sub-indices of [2022]
+                elif entries.setdefault(item, entry) is not entry:
+                    entries[item].again = entry
+                    remarks.append((number, f"object {object_name(item)} stands twice, the first one counts"))
+            continue
+        key, equals, value = text.partition("=")
+        if not equals:
+            remarks.append((number, f"'{text[:40]}' is no line of the format, passed over"))
+        elif entry is not None:
+            entry.keys.setdefault(key.strip().lower(), value.strip())
+    lost = ((n, i) for i, n in counts.items() if Object(i) not in entries)
+    return entries, remarks + [(n, f"[{i:04X}sub0] has no object [{i:04X}]") for n, i in lost]
+
+
+def _add_compact(entries: dict[Object, Entry]) -> None:
+    """Add the sub-indices that `CompactSubObj` counts; all have the type of their object."""
+    for item, entry in list(entries.items()):
+        count = _number(entry.keys.get("compactsubobj", ""))
+        for sub in range(1, min(count or 0, LAST_SUB) + 1):
+            entries.setdefault(Object(item.number, sub), Entry(entry.line, keys=entry.keys))
+
+
+def _odd(entries: dict[Object, Entry]) -> Iterator[tuple[int, str]]:
+    """Name the objects that cannot be used: without a type, or sub-indices without an object."""
+    with_subs = {o.number for o in entries if o.sub}
+    for item, entry in entries.items():
+        kind = _number(entry.keys.get("objecttype", "")) or _VARIABLE
+        if item.sub and Object(item.number) not in entries:
+            yield entry.line, f"[{item.number:04X}sub{item.sub:X}] has no object [{item.number:04X}]"
+        elif item.number not in with_subs and "objecttype" not in entry.keys and "datatype" not in entry.keys:
+            yield entry.line, f"object {object_name(item)} has neither ObjectType nor DataType"
+        elif (item.sub or item.number not in with_subs) and kind == _VARIABLE and entry.data_type is None:
+            yield entry.line, f"object {object_name(item)} has no DataType"

@@ -1,0 +1,302 @@
+"""DBC and EDS files as people have them: only what a profile names must be sound (all small files are ours)."""
+
+import re
+
+import pytest
+
+from tests.devices.harness import HEAD, make
+from thermoctl.yamlfile import InputError
+from thermoctl_hal.base.backend import ERROR, OK, ROLE, Sample
+from thermoctl_hal.base.units import dbc_unit
+from thermoctl_hal.can.bus import BY_PGN, EXTENDED, is_wanted, pgn_of
+from thermoctl_hal.can.dbc_file import load_dbc
+from thermoctl_hal.can.eds import read_eds
+
+START = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: DEV HOST\n\n'
+GOOD = 'BO_ 801 READING: 8 DEV\n SG_ Volts : 0|16@1- (0.01,0) [0|0] "V" HOST\n SG_ T : 16|8@1+ (1,-40) [0|0] "°C" HOST\n\n'
+V = "v: {message: READING, signal: Volts, unit: V, rate_hz: 20, stale_after_s: 1"
+T = "t: {message: READING, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1"
+ROLES = "{v: voltage_v, t: air_c}"
+
+
+class Frames:
+    """A CAN port that has the given frames."""
+
+    bad = ignored = 0
+
+    def __init__(self, *frames):
+        self.frames = list(frames)
+
+    def receive(self):
+        found, self.frames = self.frames, []
+        return found
+
+    def long_frames(self):
+        return []
+
+    def close(self):
+        pass
+
+
+def device(folder, dbc, channels, roles=ROLES, more=""):
+    folder.joinpath("a.dbc").write_bytes(dbc if isinstance(dbc, bytes) else dbc.encode())
+    lines = "\n".join(f"  {c}}}" for c in channels)
+    return make(folder, f"{HEAD}bus: can-dbc\ndbc: a.dbc\nchannels:\n{lines}\n", "virtual:x", roles, more)
+
+
+def read(dev, *frames):
+    dev._port, sample = Frames(*frames), Sample()
+    dev.read(sample, 1.0)
+    return sample
+
+
+FAULTS = {
+    "an id without bit 31": 'BO_ 13274 OTHER: 8 DEV\n SG_ X : 0|8@1+ (1,0) [0|0] "" HOST\n',
+    "overlapping signals": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" H\n SG_ B : 3|1@1+ (1,0) [0|0] "" H\n',
+    "a signal outside its message": 'BO_ 9 OTHER: 1 DEV\n SG_ C : 4|8@1+ (1,0) [0|0] "" HOST\n',
+    "words of no signal": 'VAL_ 801 Absent 0 "off" 1 "on" ;\n',
+    "words of no message": 'VAL_ 77 OTHER 0 "off" ;\n',
+    "a factor without a zero": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (.5,0) [0|0] "" HOST\n',
+    "a decimal comma": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (0,5,0,0) [0|0] "" HOST\n',
+    "a factor that is no number": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (x,0) [0|0] "" HOST\n',
+    "a name with a digit first": 'BO_ 9 OTHER: 8 DEV\n SG_ 2C : 0|8@1+ (1,0) [0|0] "" HOST\n',
+    "an id of 31 bits": 'BO_ 1075054137 OTHER: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" HOST\n',
+    "a comment without an object": 'CM_ 801 "OTHER";\n',
+    "two signals of one name": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" H\n SG_ C : 8|8@1+ (1,0) [0|0] "" H\n',
+    "no signal at all": "BO_ 9 OTHER: 8 DEV\n SG_ C 0|8@1+\n",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("first", [True, False])
+def test_what_a_profile_does_not_name_may_be_wrong(tmp_path, fault, first):
+    other = FAULTS[fault] + "\n"
+    dev = device(tmp_path, START + (other + GOOD if first else GOOD + other), [V, T])
+    sample = read(dev, (801, bytes.fromhex("d2043c0000000000")))
+    assert sample.value[ROLE["voltage_v"]] == pytest.approx(12.34)
+    assert sample.value[ROLE["air_c"]] == pytest.approx(20)
+    warning = dev.binding.profile.bus_spec.warning
+    line = 1 + (START + ("" if first else GOOD)).count("\n")
+    found = re.fullmatch(r".*a\.dbc:(\d+): .*", warning)
+    assert found, warning
+    assert line <= int(found[1]) <= line + 2 and re.search("OTHER|Absent", warning), warning
+
+
+@pytest.mark.parametrize(
+    "text,channel,words",
+    [
+        (GOOD + GOOD.replace("801", "802"), V, "2 messages have this name .0x321, 0x322."),
+        (GOOD.replace("801", "1075054137"), V, "has more than 29 bits"),
+        (GOOD.replace("(0.01,0)", "(x,0)"), V, "no signal of the format"),
+        (GOOD.replace(" T :", " Volts :"), V, "a second signal of this name"),
+        (GOOD, V.replace("Volts", "Vols"), "'Vols' is not one of Volts, T .did you mean 'Volts'"),
+    ],
+)
+def test_what_a_profile_names_must_be_sound(tmp_path, text, channel, words):
+    with pytest.raises(InputError, match=words) as e:
+        device(tmp_path, START + text, [channel], "{v: voltage_v}")
+    assert re.match(r".*device\.yaml:\d+:\d+: ", str(e.value)) and "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "latin-1", "cp1252", "utf-16", "utf-16-le", "utf-16-be"]
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_every_encoding_that_csv_files_have(tmp_path, encoding, end):
+    dbc = (START + GOOD + 'CM_ SG_ 801 T "Größe";\n').replace("\n", end).encode(encoding)
+    dev = device(tmp_path, dbc, [V, T])
+    assert read(dev, (801, bytes.fromhex("d2043c0000000000"))).value[ROLE["air_c"]] == pytest.approx(20)
+    assert dev.binding.profile.bus_spec.warning == ""
+
+
+@pytest.mark.parametrize(
+    "theirs", ["°F", "degF", "deg F", "Fahrenheit", "\u2109", "ºF", "K", "kelvin", "rpm", "mV"]
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
+def test_another_unit_in_the_file_is_refused(tmp_path, theirs, encoding):
+    try:
+        dbc = (START + GOOD.replace("°C", theirs)).encode(encoding)
+    except UnicodeEncodeError:
+        return
+    with pytest.raises(InputError, match="the DBC file gives T in "):
+        device(tmp_path, dbc, [T], "{t: air_c}")
+
+
+@pytest.mark.parametrize(
+    "theirs,ours",
+    [
+        ("°C", "degC"), ("C", "degC"), ("Deg_C", "degC"), ("degree C", "degC"), ("[deg. C]", "degC"), ("℃", "degC"),
+        ("ºC", "degC"), ("Â°C", "degC"), ("\ufffdC", "degC"), ("grad C", "degC"), ("celsius", "degC"), ("µm", "um"),
+        ("μm", "um"), ("micrometer", "um"), ("micron", "um"), ("millivolt", "mV"), ("MV", "MV"), ("Volts", "V"),
+        ("°K", "K"), ("°", "deg"), ("deg/s", "deg/s"), ("", ""), (None, ""), ("km/h", "km/h"), ("milliamps", "mA"),
+    ],
+)  # fmt: skip
+def test_spellings_of_units(theirs, ours):
+    assert dbc_unit(theirs) == ours
+
+
+def test_kelvin_with_an_offset_is_celsius(tmp_path):
+    device(tmp_path, START + GOOD, [T.replace("degC", "K") + ", offset: 273.15"], "{t: air_c}")
+
+
+@pytest.mark.parametrize(
+    "sentinel,raw",
+    [
+        ("327.67", 0x7FFF),
+        ("-327.68", 0x8000),
+        ("32767", 0x7FFF),
+        ("0x7FFF", 0x7FFF),
+        ("'0x8000'", 0x8000),
+        ("0xFFFF", 0xFFFF),
+    ],
+)
+def test_a_sentinel_is_compared_as_a_raw_number(tmp_path, sentinel, raw):
+    dev = device(tmp_path, START + GOOD, [f"{V}, sentinels: [{sentinel}]"], "{v: voltage_v}")
+    for data, status in ((raw, ERROR), (raw - 1 & 0xFFFF, OK), (1234, OK)):
+        sample = read(dev, (801, data.to_bytes(2, "little") + bytes(6)))
+        assert sample.status[ROLE["voltage_v"]] == status, hex(data)
+
+
+@pytest.mark.parametrize("sentinel", ["40000", "-40000", "327.675", "0x10000", "1e9"])
+def test_a_sentinel_that_cannot_come_is_refused(tmp_path, sentinel):
+    with pytest.raises(InputError, match=r"device\.yaml:\d+:\d+: sentinels: .* cannot come"):
+        device(tmp_path, START + GOOD, [f"{V}, sentinels: [{sentinel}]"], "{v: voltage_v}")
+
+
+@pytest.mark.parametrize("size", [3, 4, 7])
+def test_a_short_frame_gives_the_signals_that_it_has(tmp_path, size):
+    dev = device(tmp_path, START + GOOD, [V, T])
+    sample = read(dev, (801, bytes.fromhex("d2043c0000000000")[:size]))
+    assert sample.value[ROLE["voltage_v"]] == pytest.approx(12.34) and sample.status[ROLE["air_c"]] == OK
+    short = read(dev, (801, b"\xd2\x04"))
+    assert short.status[ROLE["voltage_v"]] == OK and short.status[ROLE["air_c"]] != OK
+    read(dev, (801, b"\xd2"))
+    assert "READING came with 1 of 8 bytes" in dev.silence()
+
+
+J1939 = 'BO_ 2566844158 ET1: 8 DEV\n SG_ T : 0|8@1+ (1,-40) [0|0] "deg C" HOST\n'
+ET1 = "t: {message: ET1, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1, sentinels: [215]"
+
+
+def test_a_j1939_message_comes_from_any_source_at_any_priority(tmp_path):
+    for can_id in (0x18FEEE00, 0x18FEEE5A, 0x0CFEEE21):
+        dev = device(tmp_path, START + J1939, [ET1], "{t: air_c}")
+        assert read(dev, (EXTENDED | can_id, b"\x5a" + bytes(7))).value[ROLE["air_c"]] == 50
+        assert read(dev, (EXTENDED | can_id, b"\xff" + bytes(7))).status[ROLE["air_c"]] == ERROR
+    dev = device(tmp_path, START + J1939, [ET1], "{t: air_c}")
+    for other in (0x18FEEF00, 0x18FEED00, 0x19FEEE00):
+        assert read(dev, (EXTENDED | other, b"\x5a" + bytes(7))).status[ROLE["air_c"]] != OK
+    assert "none is PGN 65262 of J1939" in dev.silence()
+
+
+def test_of_two_senders_of_a_group_the_first_or_the_named_one_counts(tmp_path):
+    both = [(EXTENDED | 0x18FEEE00, b"\x5a" + bytes(7)), (EXTENDED | 0x18FEEE5B, b"\x64" + bytes(7))]
+    dev = device(tmp_path, START + J1939, [ET1], "{t: air_c}")
+    assert read(dev, *both).value[ROLE["air_c"]] == 50
+    dev = device(tmp_path, START + J1939, [ET1], "{t: air_c}", ", address: 0x5B")
+    assert read(dev, *both).value[ROLE["air_c"]] == 60
+    read(dev, both[0])
+    assert "source addresses 0 send it, too: give the wanted one as 'address'" in dev.silence()
+
+
+def test_parameter_groups_of_identifiers():
+    assert pgn_of(EXTENDED | 0x18FEEE5A) == BY_PGN | 0xFEEE and pgn_of(0x7FF) == 0
+    assert pgn_of(EXTENDED | 0x0CEF1234) == BY_PGN | 0xEF00  # below 240: the receiver's address follows
+    assert is_wanted(EXTENDED | 0x18FEEE00, frozenset({BY_PGN | 0xFEEE}))
+    assert not is_wanted(0x18, frozenset({BY_PGN | 0xFEEE}))
+
+
+@pytest.mark.parametrize("text", ["", "hello", "[6041]", "BO_ x y\n", "\0" * 100])
+def test_what_is_no_dbc_file_is_refused(tmp_path, text):
+    with pytest.raises(InputError, match=r"a\.dbc is not a DBC file"):
+        device(tmp_path, text, [V], "{v: voltage_v}")
+
+
+def test_multiplexed_and_float_signals_survive_a_fault_elsewhere(tmp_path):
+    text = (
+        START
+        + FAULTS["an id without bit 31"]
+        + 'BO_ 7 M: 8 D\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" H\n SG_ 1A m0 : 8|16@1- (0.1,0) [0|0] "V" H\n'
+        + ' SG_ B m1 : 8|16@1- (1,0) [0|0] "V" H\n SG_ F : 32|32@1- (1,0) [0|0] "V" H\n\nSIG_VALTYPE_ 7 F : 1;\n'
+    )
+    tmp_path.joinpath("a.dbc").write_text(text)
+    file = load_dbc(tmp_path / "a.dbc")
+    message = file.database.get_message_by_name("M")
+    found = message.decode_simple(b"\x00\x0a\x00\x00\x00\x00\x80\x3f", False)
+    assert found["1A"] == pytest.approx(1.0) and found["F"] == 1.0 and "B" not in found and not file.faults
+
+
+EDS = "[FileInfo]\nFileName=x\n\n[6041]\nParameterName=Statusword\nObjectType=0x7\nDataType=0x0006\n\n"
+MORE = "[2022]\nParameterName=many\nObjectType=9\nSubNumber=2\n[2022sub1]\nParameterName=a\nDataType=3\n"
+ODD = {
+    "none": ("", ""),
+    "a comment without a mark": ("// a maker's remark\n", r"a\.eds:\d+: '// a maker"),
+    "a line without a key": ("what is this\n", r"a\.eds:\d+: 'what is this'"),
+    "a doubled section": ("[6041]\nDataType=6\n", r"object 0x6041 stands twice"),
+    "numbers with h": ("[2300]\nObjectType=7h\nDataType=0007h\n", ""),
+    "no type": ("[2300]\nParameterName=x\nObjectType=0x7\n", r"object 0x2300 has no DataType"),
+    "an orphaned sub-object": (
+        "[2023sub1]\nObjectType=7\nDataType=5\n",
+        r"\[2023sub1\] has no object \[2023\]",
+    ),
+    "an orphaned count": ("[2023sub0]\nObjectType=7\nDataType=5\n", r"\[2023sub0\] has no object \[2023\]"),
+    "numbers with leading zeros": ("[DeviceInfo]\nVendorNumber=001\nGranularity=\n", ""),
+    "a percent sign": ("[2300]\nParameterName=100 %\nDataType=6\nDefaultValue=%(x)s\n", ""),
+    "another case": ("[1a00SUB1]\nDATATYPE=7\n[1A00]\nobjecttype=9\n", ""),
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_an_eds_file_is_read_in_spite_of_what_is_not_named(tmp_path, odd, encoding):
+    text, warning = ODD[odd]
+    path = tmp_path / "a.eds"
+    path.write_bytes((EDS + "[DeviceInfo]\nProductName=Verstärker 5 µA\n" + MORE + text).encode(encoding))
+    found = read_eds(path)
+    assert [found.entries[k].data_type for k in ((0x6041, 0), (0x2022, 1))] == [6, 3]
+    assert re.search(warning, found.warning) if warning else found.warning == ""
+
+
+def test_compact_sub_objects_have_the_type_of_their_object(tmp_path):
+    path = tmp_path / "a.eds"
+    path.write_text("[5002]\nParameterName=array\nCompactSubObj=3\nObjectType=8\nDataType=2\n")
+    found = read_eds(path)
+    assert found.subs(0x5002) == [1, 2, 3] and found.entries[0x5002, 3].data_type == 2 and not found.warning
+
+
+DRIVE = """
+bus: can-cia402
+cia402: {eds: a.eds, node_id: 5, mode: 10, command: 0x6071, transmit: [0x6041%s], heartbeat_s: 0.02, watchdog_s: 0.1}
+drive: {unit: A, scale: 0.001, limits: [-1, 1]}
+channels:
+  state: {object: 0x6041, unit: '1', rate_hz: 100, stale_after_s: 0.1}
+"""
+TORQUE = "[6071]\nObjectType=7\nDataType=3\n"
+
+
+@pytest.mark.parametrize(
+    "more,named,words",
+    [
+        ("[2300]\nParameterName=x\n", ", 0x2300", r"object 0x2300 \(line \d+\) has no DataType"),
+        (
+            "[6077]\nDataType=3\n[6077]\nDataType=4\n",
+            ", 0x6077",
+            r"stands twice with different types \(lines 12, 14\)",
+        ),
+        (MORE, ", 0x2022", "has sub-indices; say which, as 0x2022:1"),
+        (MORE, ", '0x2022:2'", "has no sub-index 2; it has 1"),
+        (MORE, ", 0x3000", "0x3000 is not in it"),
+        ("[6077]\nDataType=9\n", ", 0x6077", "no whole number of up to 4 bytes"),
+    ],
+)
+def test_what_a_drive_names_must_be_sound_in_its_eds(tmp_path, more, named, words):
+    tmp_path.joinpath("a.eds").write_text(EDS + TORQUE + more)
+    with pytest.raises(InputError, match=words):
+        make(tmp_path, HEAD + DRIVE % named, "virtual:x", "{state: amplifier_state}")
+    assert make(tmp_path, HEAD + DRIVE % "", "virtual:x", "{state: amplifier_state}")
+
+
+def test_an_eds_without_objects_is_refused(tmp_path):
+    tmp_path.joinpath("a.eds").write_text("[FileInfo]\nFileName=x\n")
+    with pytest.raises(InputError, match="no EDS file: it has no section of an object"):
+        make(tmp_path, HEAD + DRIVE % "", "virtual:x", "{state: amplifier_state}")
