@@ -8,13 +8,7 @@ from typing import Any
 from thermoctl.yamlfile import InputError
 
 EXTRAS = {
-    "rig": {
-        "serial": "pyserial",
-        "can": "python-can",
-        "pymodbus": "pymodbus",
-        "canopen": "canopen",
-        "cantools": "cantools",
-    },
+    "rig": {"serial": "pyserial", "can": "python-can", "canopen": "canopen", "cantools": "cantools"},
     "ethercat": {"pysoem": "pysoem"},
     "report": {"matplotlib": "matplotlib"},
     "formats": {

@@ -478,13 +478,13 @@ def test_identifiers_of_both_lengths_through_the_library(tmp_path, extended):
         can.Message(arbitration_id=0x321, data=bytes(12), is_fd=True, is_extended_id=extended),
         can.Message(arbitration_id=0x321, data=bytes(64), is_fd=True, is_extended_id=extended),
         can.Message(arbitration_id=0x321, data=bytes(8), is_fd=True, is_extended_id=extended),
-        can.Message(arbitration_id=0x321, data=data[:3], is_extended_id=extended),
+        can.Message(arbitration_id=0x321, data=data[:2], is_extended_id=extended),
     ]
     for message in odd:
         sender.send(message)
     device.read(sample, 1.0)
     assert not sample.fresh.any() and device.counters()["ignored"] == 4 and device.counters()["errors"] == 1
-    assert "SHUNT_READING came with 3 bytes and does not decode" in device.silence()
+    assert "SHUNT_READING came with 2 of 8 bytes, without the signal" in device.silence()
     sender.send(can.Message(arbitration_id=0x321, data=data, is_extended_id=extended))
     device.read(sample, 1.0)
     assert sample.value[VOLTAGE] == pytest.approx(3.125)

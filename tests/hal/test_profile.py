@@ -69,7 +69,7 @@ CASES = [
     (TEXT, "text:", "text:\n  decimal: ;", "';' is not one of ., ,"),
     (SHUNT, "unit: A", "unit: mA", "gives Current in A, the profile says mA with scale 1"),
     (MODULE, "register: 0,", "register: 70000,", "is outside 0 .. 65535"),
-    (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 247"),
+    (MODULE, "modbus: {unit_id: 1", "modbus: {unit_id: 300", "is outside 0 .. 255"),
     (
         MODULE,
         "channels:\n",

@@ -72,7 +72,7 @@ def test_every_import_is_declared():
             assert names & base or module in extras, (
                 f"{path}: {module} is of an extra that thermoctl.extras cannot name"
             )
-    assert {"numpy", "crccheck", "serial", "pymodbus"} <= seen
+    assert {"numpy", "crccheck", "serial"} <= seen
 
 
 EACH_ALONE = """

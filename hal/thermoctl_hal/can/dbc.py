@@ -111,12 +111,14 @@ class DbcDevice(Device):
             self._quiet += 1
             self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
             return
-        self.counts["frames"] += 1
         if not readings and len(data) < entry[0].length:
+            self.counts["errors"] += 1
             self._quiet += 1
             self._why = (
                 f"{entry[0].name} came with {len(data)} of {entry[0].length} bytes, without the signal"
             )
+            return
+        self.counts["frames"] += 1
         for i, source, value in readings:
             self._quiet, self._why = 0, ""
             test = source.invalid

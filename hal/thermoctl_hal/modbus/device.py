@@ -54,7 +54,11 @@ EXCEPTIONS = {
 """Modbus exception codes: the text, and what to do."""
 BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # requests repeated at once; never an ERROR of the channel itself
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
-REFUSED = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)  # one register may be the cause: the block is read one by one
+ILLEGAL_FUNCTION = 1
+NOT_OF_A_REGISTER = (ILLEGAL_FUNCTION, *PASSING)
+"""Exceptions that no register can cause; after any other the block is read one by one."""
+MAX_EXPONENT = 10  # of a scale register: SunSpec allows -10 .. 10, and -32768 for none
+MUTE_POLLS = 2  # lost answers, after which a block that never came is asked for without its gaps
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
 LOST_POLLS = 3  # polls without any answer, after which the link is opened again
 MAX_BITS = 2000  # coils of one answer
@@ -124,10 +128,17 @@ class ModbusDevice(Device):
             (i, s.invalid[0], s.invalid[1]) for i, s in sources if s.invalid
         ]
         """Items to read: (bound channel, register, the test of a status register)."""
+        self._exponents = range(
+            len(self._items), len(self._items) + sum(s.exponent is not None for _, s in sources)
+        )
+        """The items that are scale registers."""
+        self._items += [(i, s.exponent, None) for i, s in sources if s.exponent is not None]
+        self._factors: dict[int, float] = {}  # bound channel -> the factor that its scale register gave
         self._state: dict[int, str] = {}  # bound channel with a status: its fault, '' when good
         self._got: list[tuple[int, float, float]] = []  # of this poll: item, raw number, time
         self._plan()
         self._lost_polls = 0
+        self._heard: set[tuple[str, int, int]] = set()  # kind, address and count of the blocks that came
 
     def _plan(self) -> None:
         registers = [(k, register) for k, (_, register, _) in enumerate(self._items)]
@@ -138,6 +149,8 @@ class ModbusDevice(Device):
         self._link = join(self.binding.port, self.binding.profile.line, self._spec.timeout_s)
         self._lost_polls = 0
         self._state.clear()
+        self._factors.clear()
+        self._heard.clear()
         self._plan()
 
     def disconnect(self) -> None:
@@ -170,8 +183,16 @@ class ModbusDevice(Device):
                     self.miss(i, f"{self._named(block)}: {e}")
                 if self._lost_polls >= LOST_POLLS:
                     raise HardwareError(f"{self.binding.port}: {self._named(block)}: {e}") from None
-                at = self._blocks.index(block) + 1  # the next poll starts after this block
-                self._blocks = self._blocks[at:] + self._blocks[:at]
+                at = self._blocks.index(block)
+                again = [block]
+                if (
+                    self._lost_polls >= MUTE_POLLS
+                    and (block.kind, block.address, block.count) not in self._heard
+                ):
+                    again = plan_blocks(block.members, 0, self._spec.max_block)  # it may be mute at gaps
+                self._blocks = (
+                    self._blocks[at + 1 :] + self._blocks[:at] + again
+                )  # the next poll starts after it
                 return
 
     def _bounds(self, block: Block) -> list[int]:
@@ -184,8 +205,11 @@ class ModbusDevice(Device):
     def _read(self, sample: Sample, block: Block) -> None:
         answer = self._request(block)
         if isinstance(answer, list):
+            self._heard.add((block.kind, block.address, block.count))
             self._take(block, answer)
-        elif answer in REFUSED and (len(block.members) > 1 or block.count > block.members[0][1].words):
+        elif answer not in NOT_OF_A_REGISTER and (
+            len(block.members) > 1 or block.count > block.members[0][1].words
+        ):
             self._read_singly(sample, block)
         else:
             self._refused(sample, block, answer)
@@ -205,6 +229,8 @@ class ModbusDevice(Device):
                 self._refused(sample, single, answer)
         bad = {i for b in refused for i, _ in b.members}
         good = plan_blocks((m for m in block.members if m[0] not in bad), 0, self._spec.max_block)
+        if not good:
+            return  # it is not for one of the registers
         at = self._blocks.index(block)
         self._blocks[at : at + 1] = [*good, *refused]
 
@@ -241,9 +267,32 @@ class ModbusDevice(Device):
 
     def _store(self, sample: Sample) -> None:
         """Store the readings of this poll; those whose status register reports a fault are errors."""
+        self._store_tests()
+        for k, raw, time_s in self._got:
+            i, register, test = self._items[k]
+            if test is not None or k in self._exponents:
+                continue
+            factor = 1.0 if register.exponent is None else self._factors.get(i)
+            state = self._state.get(i) if register.invalid else ""
+            if state:
+                self.fail(sample, i, state)
+            elif state is None or factor is None:
+                what = "status" if state is None else "scale"
+                self.miss(i, f"its {what} register has not been read yet")
+            elif raw in register.sentinels or math.isnan(raw):
+                self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
+            elif math.isnan(factor):
+                self.fail(sample, i, "its scale register reads no scale: the device has no such value")
+            else:
+                self.put(sample, i, raw * factor, time_s)
+
+    def _store_tests(self) -> None:
+        """Keep what the status registers and the scale registers of this poll say."""
         for k, raw, _ in self._got:
             i, register, test = self._items[k]
-            if test is not None:
+            if k in self._exponents:
+                self._factors[i] = 10.0**raw if abs(raw) <= MAX_EXPONENT else math.nan
+            elif test is not None:
                 bits = int(raw) & test.mask
                 self._state[i] = (
                     ""
@@ -251,19 +300,6 @@ class ModbusDevice(Device):
                     else f"{register.kind} {register.address} reads 0x{bits:X}, a good reading has "
                     f"0x{test.value:X}: the device reports a fault of this channel (open wire?)"
                 )
-        for k, raw, time_s in self._got:
-            i, register, test = self._items[k]
-            if test is not None:
-                continue
-            state = self._state.get(i) if register.invalid else ""
-            if state:
-                self.fail(sample, i, state)
-            elif state is None:
-                self.miss(i, "its status register has not been read yet")
-            elif raw in register.sentinels or math.isnan(raw):
-                self.fail(sample, i, f"register {register.address} reads {raw:g}: open or missing sensor")
-            else:
-                self.put(sample, i, raw, time_s)
 
     def _refused(self, sample: Sample, block: Block, code: int) -> None:
         """Note the exception of an answer; it becomes the channel's ERROR when the last reading is stale."""

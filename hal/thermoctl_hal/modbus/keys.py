@@ -8,7 +8,7 @@ MAX_ADDRESS, MAX_MODBUS_BITS = 65535, 64
 
 MODBUS: dict[str, tuple[Key, ...]] = {
     "modbus": (
-        Key("unit_id", "integer", "unit (binding: `address`)", 1, "", 0, 247),
+        Key("unit_id", "integer", "unit (binding: `address`); above 247 only on TCP", 1, "", 0, 255),
         Key("timeout_s", "number", "longest time for an answer", 0.3, "s", 0.01, 10),
         Key("max_gap", "integer", "registers are read together over gaps of up to this many", 8, "", 0, 100),
         Key("max_block", "integer", "registers read by one request, at most", 100, "", 1, 125),
@@ -36,7 +36,23 @@ MODBUS: dict[str, tuple[Key, ...]] = {
         Key("byte_order", "text", "order of the two bytes of a word", "big", choices=("big", "little")),
         *bits_of("the register"),
         Key("signed", "flag", "the bits are a two's complement", False),
-        Key("sentinels", "list", "raw numbers that mean 'no sensor'", None, example="[32767]"),
+        Key(
+            "sentinels",
+            "list",
+            "raw numbers that mean 'no sensor'; 0x.. are the bits of the register",
+            None,
+            example="[32767, 0x8000]",
+        ),
+        Key(
+            "scale_register",
+            "integer",
+            "register of a whole number n with sign: the value counts 10^n (SunSpec's scale factors)",
+            None,
+            "",
+            0,
+            MAX_ADDRESS,
+            example="40077",
+        ),
         Key("invalid", "section", "a register or bit that says that the reading is wrong (open wire)", None),
     ),
     "invalid of modbus": (

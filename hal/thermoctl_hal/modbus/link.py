@@ -1,22 +1,27 @@
 """Modbus connections: opened once for all the devices of a port, one request at a time.
 
-No other module uses pymodbus, which renames its interface in minor releases.
+Ports: "tcp:host:port" (Modbus TCP), "rtu:/dev/serial/by-id/..." (a serial line) and
+"rtu:socket://host:port" (RTU frames over TCP, as serial device servers forward them).
 
-Ports: "tcp:host:port" (Modbus TCP), "rtu:/dev/serial/by-id/..." (a serial line) and "rtu:socket://host:port"
-(RTU frames over TCP, as serial device servers forward them).
+    TCP     transaction id, 0, length (uint16 each), unit, PDU      the answer repeats id, unit and function
+    RTU     unit, PDU, CRC                                          the answer repeats unit and function
+
+Bytes that arrived before a request, such as a late answer, are dropped. A server that closes the connection
+after an answer is connected again for the next request. One that is silent after connecting gets more
+time at each connection before it is asked. On a serial line the echo of the request and bytes before the
+answer are passed over.
 """
 
 from __future__ import annotations
 
-import logging
+import os
 import re
+import select
+import socket
+import struct
 import threading
-from typing import Any
-
-import serial
-from pymodbus import FramerType, ModbusException
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-from pymodbus.exceptions import ConnectionException
+import time
+from dataclasses import dataclass
 
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.profile import LineSettings
@@ -25,135 +30,317 @@ from thermoctl_hal.serial.line import NETWORK, open_port
 
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """Modbus function code that reads a kind."""
-MIN_FRAME, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
+BITS = ("coil", "discrete")
+WRITE_COIL, WRITE_SEVERAL, COIL_ON = 5, 16, 0xFF00
+REFUSAL = 0x80  # bit of the function code of an exception
+MIN_RTU, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
+HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
+SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
+"""Pause between connecting and the first request: one step more after each connection that gave no answer."""
+GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
+CHUNK = 4096
+ATTEMPTS = 3  # of one request, where the server closes the connection
 _HOST = r"(\[[^]]+\]|[^:/]+):(\d+)/?"
 _PORT = re.compile(rf"(?:tcp:|(?P<rtu>rtu:{NETWORK})){_HOST}")
-_METHODS = {
-    "coil": "read_coils",
-    "discrete": "read_discrete_inputs",
-    "holding": "read_holding_registers",
-    "input": "read_input_registers",
-}
-
-WRITE_COIL, WRITE_SEVERAL = 5, 16
-_WRITERS = {WRITE_COIL: "write_coil", 6: "write_register", WRITE_SEVERAL: "write_registers"}
 
 
 class NoAnswer(Exception):
     """No valid answer to a request: lost, cut short, wrong checksum, another unit."""
 
 
+class _Closed(Exception):
+    """The other end closed the connection."""
+
+
+@dataclass(frozen=True)
+class _Request:
+    """A request: unit, PDU and the bytes of the frame; transaction id of TCP."""
+
+    unit: int
+    pdu: bytes
+    frame: bytes
+    transaction: int = 0
+
+    @property
+    def function(self) -> int:
+        """Return the function code."""
+        return self.pdu[0]
+
+
 class Link:
     """An open port. `users` counts its devices; `broken`: to be opened again."""
 
     def __init__(self, port: str, line: LineSettings, timeout_s: float) -> None:
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # our errors say the same
         self.port, self.line, self.users, self.broken = port, line, 0, False
-        self._received = b""  # after the last request
         self._lock = threading.Lock()
-        common: dict[str, Any] = {"timeout": timeout_s, "retries": 0, "trace_packet": self._trace}
-        network = _PORT.fullmatch(port)
+        self._transaction = 0
+        self._echoes = False  # this line sends our own bytes back
+        self._answered = False
+        self._free_s = 0.0  # an RTU frame may begin from then on
         self._is_rtu = port.startswith("rtu:")
-        self.client: Any
-        try:
-            if network:
-                framer = FramerType.RTU if self._is_rtu else FramerType.SOCKET
-                self.client = ModbusTcpClient(
-                    network[2].strip("[]"), port=int(network[3]), framer=framer, **common
-                )
-            elif self._is_rtu and not port.startswith(f"rtu:{NETWORK}"):
-                open_port(port[4:], line).close()  # its errors give the remedy, and it sets the latency timer
-                self.client = ModbusSerialClient(
-                    port[4:],
-                    baudrate=line.baud,
-                    bytesize=line.data_bits,
-                    parity=line.parity,
-                    stopbits=line.stop_bits,
-                    **common,
-                )
-            else:
+        self._network = _PORT.fullmatch(port)
+        if self._network is None and (not self._is_rtu or port.startswith(f"rtu:{NETWORK}")):
+            raise HardwareError(
+                f"port '{port}': tcp:host:port, rtu:/dev/... or rtu:socket://host:port was expected"
+            )
+        self._open(timeout_s)
+        if self._network is not None:
+            self._free_s += SETTLE_S[_SILENT.get(port, 0)]
+
+    def _open(self, timeout_s: float) -> None:
+        """Open the port. Raises HardwareError."""
+        self._line: socket.socket | _Serial
+        if self._network is None:
+            self._line = _Serial(open_port(self.port[4:], self.line))
+        else:
+            host = self._network[2].strip("[]"), int(self._network[3])
+            try:
+                self._line = socket.create_connection(host, max(timeout_s, 1.0))
+                self._line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._line.setblocking(False)
+            except (OSError, OverflowError) as e:
                 raise HardwareError(
-                    f"port '{port}': tcp:host:port, rtu:/dev/... or rtu:socket://host:port was expected"
-                )
-            connected = self.client.connect()
-        except (OSError, ModbusException, serial.SerialException) as e:
-            raise HardwareError(f"{port}: cannot be opened ({e})") from None
-        if not connected:
-            self.client.close()
-            raise HardwareError(f"{port}: nobody answers: check power, network and address")
+                    f"{self.port}: nobody answers ({e}): check power, network and address"
+                ) from None
+        self._free_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the port."""
-        self.client.close()
+        """Close the port. A network port that never answered gets more time at its next opening."""
+        if self._network is not None and not self._answered:
+            _SILENT[self.port] = min(_SILENT.get(self.port, 0) + 1, len(SETTLE_S) - 1)
+        self._line.close()
 
     def read(self, kind: str, address: int, count: int, unit: int, timeout_s: float) -> list[int] | int:
         """Return registers (uint16) or bits (0, 1), or the exception code that the unit answers with.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
-        with self._lock:
-            answer = self._ask(_METHODS[kind], address, {"count": count}, unit, timeout_s)
-        if answer.isError():
-            return int(getattr(answer, "exception_code", 0))
-        if kind in ("coil", "discrete"):
-            found = [int(b) for b in getattr(answer, "bits", None) or ()]
-            values = found[:count] if len(found) == -(-count // 8) * 8 else found
-        else:
-            values = list(getattr(answer, "registers", None) or ())
-        if answer.function_code != FUNCTIONS[kind]:
-            raise NoAnswer(f"function {answer.function_code} was answered, {kind} registers were asked for")
-        if len(values) != count:
-            raise NoAnswer(f"{len(values)} registers were answered, {count} were asked for")
-        return values
+        size = -(-count // 8) if kind in BITS else 2 * count
+        answer = self._ask(struct.pack(">BHH", FUNCTIONS[kind], address, count), unit, timeout_s)
+        if answer[0] & REFUSAL:
+            return answer[1]
+        data = answer[2:]
+        if answer[1] != size or len(data) != size:
+            raise NoAnswer(
+                f"wrong length: {len(data)} bytes of data were answered, {size} were asked for: check 'type' and "
+                "'max_block'"
+            )
+        if kind in BITS:
+            return [data[k // 8] >> k % 8 & 1 for k in range(count)]
+        return list(struct.unpack(f">{count}H", data))
 
     def write(self, function: int, address: int, words: list[int], unit: int, timeout_s: float) -> int:
         """Write a coil (5), a register (6) or registers (16); return 0, or the exception code.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
-        method, what = _WRITERS[function], words if function == WRITE_SEVERAL else words[0]
-        key = {5: "value", 6: "value", WRITE_SEVERAL: "values"}[function]
-        with self._lock:
-            answer = self._ask(
-                method, address, {key: bool(what) if function == WRITE_COIL else what}, unit, timeout_s
-            )
-        if answer.isError():
-            return int(getattr(answer, "exception_code", 0)) or 4
-        if answer.function_code != function:
-            raise NoAnswer(f"function {answer.function_code} was answered, {function} was asked for")
+        pdu = struct.pack(">BH", function, address)
+        if function == WRITE_SEVERAL:
+            pdu += struct.pack(f">HB{len(words)}H", len(words), 2 * len(words), *words)
+        else:
+            pdu += struct.pack(">H", COIL_ON * bool(words[0]) if function == WRITE_COIL else words[0])
+        answer = self._ask(pdu, unit, timeout_s)
+        if answer[0] & REFUSAL:
+            return answer[1] or 4
+        if answer != pdu[:5]:
+            raise NoAnswer(f"another value was confirmed ({answer.hex(' ')}): check 'register' and 'type'")
         return 0
 
-    def _ask(self, method: str, address: int, what: dict[str, Any], unit: int, timeout_s: float) -> Any:
-        if self.broken:  # pymodbus would open the port again, beside the link that replaces this one
-            raise HardwareError(f"{self.port}: the connection is gone")
-        self._received = b""
-        self.client.comm_params.timeout_connect = timeout_s
-        try:
-            return getattr(self.client, method)(address, **what, device_id=unit)
-        except (ConnectionException, OSError, serial.SerialException) as e:
-            self.broken = True
-            self.client.close()
-            raise HardwareError(f"{self.port}: the connection is gone ({e})") from None
-        except Exception:  # foreign bytes may raise anything in the library
-            raise NoAnswer(self._bad_answer(unit, timeout_s)) from None
+    def _ask(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+        """Return the PDU of the answer. Raises NoAnswer, or HardwareError when the link is gone."""
+        with self._lock:
+            if self.broken:
+                raise HardwareError(f"{self.port}: the connection is gone")
+            try:
+                answer = self._ask_again(pdu, unit, timeout_s)
+            except HardwareError:  # it could not be connected again
+                self.broken = True
+                raise
+            except OSError as e:
+                self.broken = True
+                self._line.close()
+                raise HardwareError(f"{self.port}: the connection is gone ({e})") from None
+            self._answered = True
+            _SILENT.pop(self.port, None)
+            return answer
 
-    def _trace(self, sending: bool, data: bytes) -> bytes:
-        if not sending:
-            self._received = data
+    def _ask_again(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+        """Ask; again over a new connection where a server that has answered before closed this one."""
+        for left in reversed(range(ATTEMPTS)):
+            try:
+                return self._ask_once(pdu, unit, timeout_s)
+            except (_Closed, ConnectionError) as e:
+                if self._network is None:
+                    raise OSError("it was unplugged") from None
+                if not left or not self._answered:
+                    raise OSError(str(e) or "the server closes it without an answer") from None
+            self._line.close()
+            self._open(timeout_s)
+        raise AssertionError("the last attempt raises")
+
+    def _ask_once(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+        """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
+        time.sleep(max(0.0, self._free_s - time.monotonic()))
+        self._drop()
+        request = self._framed(pdu, unit)
+        end = time.monotonic() + timeout_s
+        self._send(request.frame, end)
+        received = b""
+        while (left := end - time.monotonic()) > 0.0:
+            if not select.select([self._line], [], [], left)[0]:
+                break
+            received += self._take()
+            answer = self._found_rtu(received, request) if self._is_rtu else _found_tcp(received, request)
+            if answer is not None:
+                self._rest()
+                return answer
+        self._rest()
+        raise NoAnswer(self._why(received, request, timeout_s))
+
+    def _rest(self) -> None:
+        """Keep the silence that must follow an RTU frame."""
+        characters = GAP_CHARACTERS * (2 + self.line.data_bits + self.line.stop_bits) / self.line.baud
+        self._free_s = time.monotonic() + (max(GAP_MIN_S, characters) if self._is_rtu else 0.0)
+
+    def _framed(self, pdu: bytes, unit: int) -> _Request:
+        if self._is_rtu:
+            body = bytes((unit,)) + pdu
+            return _Request(unit, pdu, body + checksum("modbus", body).to_bytes(2, "little"))
+        self._transaction = self._transaction % 0xFFFF + 1
+        head = struct.pack(">HHHB", self._transaction, 0, len(pdu) + 1, unit)
+        return _Request(unit, pdu, head + pdu, self._transaction)
+
+    def _drop(self) -> None:
+        """Drop the bytes that came before this request. Raises _Closed, OSError."""
+        while select.select([self._line], [], [], 0.0)[0]:
+            self._take()
+
+    def _take(self) -> bytes:
+        try:
+            data = os.read(self._line.fileno(), CHUNK)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise _Closed
         return data
 
-    def _bad_answer(self, unit: int, timeout_s: float) -> str:
-        data = self._received
+    def _send(self, data: bytes, end_s: float) -> None:
+        while data:
+            left = end_s - time.monotonic()
+            if left <= 0.0 or not select.select([], [self._line], [], left)[1]:
+                raise NoAnswer("the line takes no bytes: check its adapter, or the network")
+            data = data[os.write(self._line.fileno(), data) :]
+
+    def _found_rtu(self, received: bytes, request: _Request) -> bytes | None:
+        """Return the answer's PDU, if it is there: behind the echo of the request, zeros and other bytes."""
+        at = 0
+        is_write = request.function in (WRITE_COIL, 6)
+        if received.startswith(request.frame) and (not is_write or self._echoes):
+            at = len(request.frame)
+            self._echoes = True
+        for begin in range(at, len(received) - MIN_RTU):
+            if received[begin] != request.unit:
+                continue
+            size = _rtu_size(received[begin:], request)
+            frame = received[begin : begin + size]
+            if size and len(frame) == size and _has_good_crc(frame):
+                return frame[1:-2]
+        return None
+
+    def _why(self, data: bytes, request: _Request, timeout_s: float) -> str:
+        """Say what came instead of the answer, and which key cures it."""
+        if self._is_rtu and data.startswith(request.frame):
+            data = data[len(request.frame) :]
+            if not data:
+                return f"only the echo of the request came back: check wiring and address {request.unit}"
         if not data:
-            return f"no answer within {timeout_s:g} s: check power, wiring, address {unit} and the line's settings"
+            return (
+                f"no answer within {timeout_s:g} s: check power, wiring, address {request.unit} and the line's "
+                "settings; a slow device needs a longer 'timeout_s', one that is mute at gaps max_gap: 0"
+            )
         more = " .." if len(data) > SHOWN else ""
         text = f"no valid answer: {len(data)} bytes came ({data[:SHOWN].hex(' ')}{more})"
         if not self._is_rtu:
-            return f"{text}: cut short, or no Modbus TCP"
-        if len(data) < MIN_FRAME or checksum("modbus", data[:-2]) != int.from_bytes(data[-2:], "little"):
+            return f"{text}: {_wrong_tcp(data, request)}"
+        data = data.lstrip(b"\0") if request.unit else data
+        if len(data) < MIN_RTU or not _has_good_crc(data):
             return f"{text} with a wrong CRC, or cut short: check the baud rate, parity, termination and other masters"
-        return f"{text} of unit {data[0]}, unit {unit} was asked: check 'address'"
+        if data[0] != request.unit:
+            return f"{text} of unit {data[0]}, unit {request.unit} was asked: check 'address'"
+        if data[1] & ~REFUSAL != request.function:
+            return f"{text} with function {data[1]}, {request.function} was asked for: check 'kind'"
+        return f"{text} of a wrong length: check 'type' and 'max_block'"
+
+
+class _Serial:
+    """A serial port as a line: its descriptor, and the handle that closes it."""
+
+    def __init__(self, handle: object) -> None:
+        self._handle = handle
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return int(self._handle.fileno())  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        """Close the port."""
+        self._handle.close()  # type: ignore[attr-defined]
+
+
+def _rtu_size(data: bytes, request: _Request) -> int:
+    """Return the bytes of the RTU answer at the beginning of `data`, 0 where it is none to this request."""
+    if data[1] == request.function | REFUSAL:
+        return 5
+    if data[1] != request.function:
+        return 0
+    return 8 if request.function in (WRITE_COIL, 6, WRITE_SEVERAL) else 5 + data[2]
+
+
+def _has_good_crc(frame: bytes) -> bool:
+    return checksum("modbus", frame[:-2]) == int.from_bytes(frame[-2:], "little")
+
+
+def _frames(data: bytes) -> tuple[list[tuple[int, int, int, bytes]], bytes]:
+    """Return the TCP frames of `data` as (transaction, protocol, unit, PDU), and the bytes behind them."""
+    found = []
+    while len(data) > HEAD:
+        transaction, protocol, length, unit = struct.unpack_from(">HHHB", data)
+        if protocol or not 2 <= length <= LONGEST_PDU + 1 or len(data) < HEAD - 1 + length:
+            break
+        found.append((transaction, protocol, unit, data[HEAD : HEAD - 1 + length]))
+        data = data[HEAD - 1 + length :]
+    return found, data
+
+
+def _found_tcp(received: bytes, request: _Request) -> bytes | None:
+    """Return the PDU of the answer that repeats transaction, unit and function, if it is there."""
+    for transaction, _, unit, pdu in _frames(received)[0]:
+        same = transaction == request.transaction and unit == request.unit
+        if same and pdu[0] & ~REFUSAL == request.function and len(pdu) > 1:
+            return pdu
+    return None
+
+
+def _wrong_tcp(data: bytes, request: _Request) -> str:
+    """Say what is wrong with TCP bytes that are no answer."""
+    frames, rest = _frames(data)
+    if not frames:
+        if len(rest) > HEAD and rest[2:4] == b"\0\0" and struct.unpack(">H", rest[4:6])[0] > len(rest) - 6:
+            return f"wrong length: {struct.unpack('>H', rest[4:6])[0]} bytes are announced, {len(rest) - 6} came: cut short"
+        return "cut short, or no Modbus TCP; RTU frames over TCP are port: rtu:socket://host:port"
+    transaction, _, unit, pdu = frames[-1]
+    if transaction != request.transaction:
+        return (
+            f"transaction id {transaction}, {request.transaction} was asked: an answer to an earlier request (raise "
+            "'timeout_s'), or a gateway that does not repeat it (port: rtu:socket://host:port, if it forwards RTU)"
+        )
+    if unit != request.unit:
+        return f"unit {unit}, unit {request.unit} was asked: address: {unit}"
+    if pdu[0] & ~REFUSAL != request.function:
+        return f"function {pdu[0]}, {request.function} was asked: check 'kind'"
+    return f"wrong length: {len(pdu)} bytes of function {pdu[0]}"
 
 
 _LINKS: dict[str, Link] = {}
+_SILENT: dict[str, int] = {}  # network port -> connections in a row that gave no answer
 _LOCK = threading.Lock()
 
 

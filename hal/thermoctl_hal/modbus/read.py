@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from thermoctl.yamlfile import Section, number_of
-from thermoctl_hal.base.key import take
+from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     BIT_KINDS,
     REGISTER_TYPES,
@@ -37,29 +38,45 @@ def read_modbus(top: Section, folder: Path) -> Modbus:
 def read_register(s: Section, spec: BusSpec) -> Register:
     """Read the place of a channel of a Modbus device: registers, a coil or a discrete input."""
     k = take(s, MODBUS["channel of modbus"])
-    sentinels = tuple(number_of(n, "sentinels") for n in k["sentinels"] or ())
     invalid = _invalid(k["invalid"])
+    exponent = None if k["scale_register"] is None else Register(k["kind"], k["scale_register"])
     if k["kind"] in BIT_KINDS:
-        for key in ("type", "word_order", "byte_order", "low_bit", "bits"):
+        for key in ("type", "word_order", "byte_order", "low_bit", "bits", "scale_register"):
             if (node := s.get(key, False)) is not None:
                 raise node.error(f"{key}: a {k['kind']} is one bit and has none")
-        return Register(k["kind"], k["register"], "bit", sentinels=sentinels, invalid=invalid)
+        bits = tuple(sentinel_of(n, 1, False) for n in k["sentinels"] or ())
+        return Register(k["kind"], k["register"], "bit", sentinels=bits, invalid=invalid)
     types = [t for t in REGISTER_TYPES if t != "bit"]
     source = Register(
         k["kind"],
         k["register"],
         s.text("type", "int16", types),
         k["word_order"],
-        sentinels,
+        (),
         k["byte_order"],
         (k["low_bit"], k["bits"]),
         k["signed"],
         invalid,
+        exponent,
     )
     if source.address + source.words > REGISTERS or source.words > typed(spec, Modbus).max_block:
         raise s.node.error(f"register: {source.words} registers from {source.address} do not fit")
     _check_bits(s, k, source)
-    return source
+    return replace(source, sentinels=tuple(_sentinel(n, source) for n in k["sentinels"] or ()))
+
+
+def _sentinel(node: Node, source: Register) -> float:
+    """Return a sentinel as the raw number that `decode` gives. Raises InputError."""
+    width = _WORD_BITS * source.words
+    if source.bits[1]:
+        return sentinel_of(node, source.bits[1], source.signed)
+    if source.type.startswith("bcd"):
+        value = number_of(node, "sentinels")
+        if not 0 <= value < 10 ** (width // 4):
+            raise node.error(f"sentinels: {value:g} has more than the {width // 4} digits of {source.type}")
+        return float(value)
+    letter = {"float32": "f", "float64": "d"}.get(source.type, "")
+    return sentinel_of(node, width, not source.type.startswith("u"), letter)
 
 
 def _check_bits(s: Section, k: dict[str, Any], source: Register) -> None:
