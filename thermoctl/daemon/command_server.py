@@ -91,7 +91,7 @@ class Commands:
             return {"ok": True, **latency(self.shared, self.settings.loop.period_s)}
         if name == "signals":
             return {"ok": True, "signals": [[s.name, s.unit, s.meaning] for s in self.shared.row.signals]}
-        actions = {
+        actions: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "arm": self._arm,
             "disarm": self._disarm,
             "setpoint": self._setpoint,

@@ -317,12 +317,15 @@ class RecordingWriter:
             for again in ("", *(f"-{i}" for i in range(1, 1000))):
                 stem = self.directory / f"{rig}-{stamp}{again}"
                 try:
-                    self._full_file = StreamFile(stem.with_name(stem.name + FULL), full)
+                    file = StreamFile(stem.with_name(stem.name + FULL), full)
                     break
                 except FileExistsError:
                     continue
+            else:
+                raise FileExistsError(f"{self.directory}: a thousand files begin with {rig}-{stamp}")
+            self._full_file = file
             self._tier_file = StreamFile(stem.with_name(stem.name + TIER), tier)
-            prune(self.directory, FULL, self.budget + self._full_file.bytes, self.path)
+            prune(self.directory, FULL, self.budget + file.bytes, self.path)
             prune(self.directory, TIER, self.tier_budget + self._tier_file.bytes, self._tier_file.path)
         except OSError as e:
             self._fail(e)
