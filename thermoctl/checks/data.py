@@ -36,10 +36,10 @@ def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Fi
         values = table.columns[item.column][there]
         if not there.any():
             found.append(_empty(table, item.name, item.column))
-        elif len(values) >= FEW:
+        elif len(values) >= FEW and item.name in model.plant.outputs:
+            # A periodic input repeats by itself; measured noise does not.
             found += _copies(table, item.column, values, table.t[there])
-            if item.name in model.plant.outputs:
-                found += _resampled(table, item.column, values)
+            found += _resampled(table, item.column, values)
     try:
         simulated = model.run(excitation).y
     except SimulationError:

@@ -140,7 +140,10 @@ def _stability(model: Model, excitation: Excitation) -> list[Finding]:
             plant.file,
             f"the plant is unstable at the start of '{excitation.name}': a deviation doubles every "
             f"{np.log(2) / growth:.3g} s, and the recording lasts {span:.4g} s",
-            turn if suspects else "A free run cannot follow such a plant: check the signs of its flows.",
+            turn
+            if suspects
+            else "An oscillator or a population grows so; else check the signs of its flows.",
+            severe=False,
         )
     ]
 

@@ -114,7 +114,9 @@ def diagnose(args: argparse.Namespace) -> int:
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
         """Diagnose the recordings given, and those that the experiments added."""
-        added = read_recordings(plant, recordings[len(given) :])  # of --resolve: written by thermoctl
+        added = read_recordings(
+            plant, recordings[len(args.recordings) :]
+        )  # of --resolve: written by thermoctl
         return _run(args, plant, [*given, *added], held_out)
 
     try:

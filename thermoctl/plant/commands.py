@@ -63,7 +63,8 @@ def simulate(args: argparse.Namespace) -> int:
     initial = _initial(plant, args)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
-    for path, table in zip(args.recordings, _read(plant, args.recordings, args), strict=True):
+    for table in _read(plant, args.recordings, args):
+        path = table.path
         excitation = model.excitation(table)
         if note := with_start(model, excitation, initial):
             print(f"note: {path}: {note}", file=sys.stderr)

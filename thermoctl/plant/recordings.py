@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.plant.language import Input, Output, Plant
+from thermoctl.plant.parts import all_parts
 from thermoctl.plant.units import conversion
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
@@ -28,10 +29,13 @@ def read_recordings(
 ) -> list[Table]:
     """Read the recordings of any logger for a plant, in its units. Raises InputError.
 
+    A recording with a gap becomes parts (`plant.parts`).
+
     `time`: the column of times; `columns`: name that the plant reads: name in the file; `how`: see
     `logger.How`."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is Arrow's and numpy's
-        return list(pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns, **how)), paths))
+        read = pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns, **how)), paths)
+        return all_parts(plant, list(read))
 
 
 def in_plant_units(plant: Plant, table: Table) -> Table:

@@ -15,6 +15,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.fmu import Cosimulation, opened
 from thermoctl.plant.language import Plant
+from thermoctl.plant.parts import RESTARTED, direct_outputs
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.sensor import error
 from thermoctl.recording.table import Table
@@ -147,7 +148,11 @@ class Model:
                 known = y[np.isfinite(y[:, j]), j]
                 if len(known):
                     first.setdefault(o.name, float(known[0]))
-        return Excitation(table.name, t, u, y, first, linear)
+        x0 = None
+        if RESTARTED in table.meta:
+            read = direct_outputs(self.plant)
+            x0 = np.array([first.get(read.get(n, ""), np.nan) for n in self.states])
+        return Excitation(table.name, t, u, y, first, linear, x0=x0)
 
     def vector(
         self, parameters: Mapping[str, float] | np.ndarray | None, recording: str | None = None

@@ -1,0 +1,76 @@
+"""A recording with a gap is read as parts, each with a start of its own; a jump of the clock is named."""
+
+import numpy as np
+import pytest
+
+from thermoctl.plant.files import loads
+from thermoctl.plant.parts import in_parts
+from thermoctl.plant.refit import fit
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.table import Table
+
+PLANT = """format: thermoctl-plant/1
+inputs:
+  heat: {unit: W}
+  air: {unit: degC, between_samples: linear}
+parameters:
+  C: {value: 80, unit: J/K, range: [20, 300]}
+  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
+nodes:
+  one: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: one, rate: heat, unit: W}
+  loss: {from: one, rate: G * (one - air), unit: W}
+outputs:
+  T: {value: one, unit: degC, noise: 0.05}
+"""
+
+
+def run(jump_s=0.0, missing=None, heat_between=10.0):
+    """Return a recording of 1200 s, one row each 2 s: rows left out, or a clock that jumps at 600 s."""
+    rng, t = np.random.default_rng(1), np.arange(0.0, 1200, 2)
+    heat = np.where((t < 160) | ((t >= 400) & (t < 600)), heat_between, 0.0) + np.where(t >= 800, 5.0, 0.0)
+    one = np.empty_like(t)
+    one[0] = 22.0
+    for k in range(len(t) - 1):
+        end = 22 + heat[k] / 0.2
+        one[k + 1] = end + (one[k] - end) * np.exp(-2 * 0.2 / 100)
+    kept = np.ones(len(t), bool) if missing is None else (t < missing[0]) | (t >= missing[1])
+    shown = np.where(t >= 600, t + jump_s, t)
+    columns = {"heat": heat, "air": np.full(len(t), 22.0), "T": one + 0.05 * rng.standard_normal(len(t))}
+    return Table("run", "run.csv", shown[kept], {n: v[kept] for n, v in columns.items()})
+
+
+@pytest.mark.parametrize(
+    ("table", "word"),
+    [
+        (run(missing=(400, 600)), "inputs may have changed meanwhile"),
+        (run(jump_s=3600.0), "a jump of the clock (daylight saving?)"),
+        (run(jump_s=500.0), "as if no time had passed"),
+    ],
+    ids=["a gap", "an hour", "another jump"],
+)
+def test_parts_start_by_their_readings(table, word):
+    plant = loads(PLANT, "plant.yaml")
+    parts = in_parts(plant, table)
+    assert len(parts) == 2 and sum(map(len, parts)) == len(table)
+    assert any(word in n for n in parts[0].notes), parts[0].notes
+    model = compile_plant(plant)
+    found = fit(model, [model.excitation(p) for p in parts])
+    values = dict(zip(model.parameters, found.values[0], strict=False))
+    assert values["C"] == pytest.approx(100, rel=0.02) and values["G"] == pytest.approx(0.2, rel=0.02)
+    assert found.rms()["T"] < 0.06
+
+
+def test_a_whole_recording_is_one_part():
+    plant = loads(PLANT, "plant.yaml")
+    table = run()
+    assert in_parts(plant, table) == [table]
+
+
+def test_an_unknown_state_after_a_gap_leaves_the_rest_out():
+    plant = loads(
+        PLANT.replace(", initial_sigma: 0.5", "").replace("value: one,", "value: 2 * one,"), "plant.yaml"
+    )
+    (part,) = in_parts(plant, run(missing=(400, 600)))
+    assert part.t[-1] < 400 and any("nothing states where 'one' starts" in n for n in part.notes)
