@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from tests.plants import FREE_CARRIAGE, ONE_BLOCK
+from thermoctl.diagnose import search
+from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.observer import drifts, held, linear
 from thermoctl.diagnose.rig import Rig
 from thermoctl.plant import loads
 from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 
@@ -56,6 +59,20 @@ def test_an_observer_is_no_place_of_physics():
     assert followed is not None
     rig = Rig(followed, [compile_plant(followed).excitation(table)], [table.columns])
     assert rig.physics.flows.keys() == plant.flows.keys() and rig.physics.inputs.keys() == plant.inputs.keys()
+
+
+def test_an_observer_that_fails_does_not_end_the_search(monkeypatch):
+    plant, table = loads(FREE_CARRIAGE), _recorded()
+    s = search.started(case(plant, [table], {}, Budget(8)), limits())
+    tried = []
+
+    def fails(of, followed):
+        tried.append(followed)
+        raise SimulationError("the simulation gives values that are not numbers")
+
+    monkeypatch.setattr(search, "_following", fails)
+    assert not search.with_observer(s)
+    assert len(tried) == 2 and s.best.fitted.hypothesis.keys == frozenset()
 
 
 def test_a_heated_block_forgets_where_it_started():

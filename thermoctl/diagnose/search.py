@@ -248,13 +248,10 @@ def with_observer(s: Search) -> bool:
         plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
         if plant is None:
             break
-        model = compile_plant(plant)
-        null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
-        budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
-        following = started(
-            dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING), s.limits
-        )
-        grow(following)
+        try:
+            following = _following(s, plant)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue  # the plant with an observer cannot be simulated: the free search stands
         for w in leaders(list(following.tried.values()), s.limits):
             effects = w.fitted.hypothesis.effects
             free = rebuilt(s, effects, w.fitted, None) if effects else None
@@ -263,6 +260,17 @@ def with_observer(s: Search) -> bool:
         if len(s.tried) > known:
             break
     return len(s.tried) > known
+
+
+def _following(s: Search, plant: Plant) -> Search:
+    """Return a search with a plant that follows its recordings. Raises SimulationError."""
+    case, model = s.case, compile_plant(plant)
+    null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
+    budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+    own = dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING)
+    following = started(own, s.limits)
+    grow(following)
+    return following
 
 
 def recall(s: Search) -> None:
