@@ -113,6 +113,11 @@ TABLE: Table = {
                 "--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"
             ),
             argument(
+                "--why",
+                metavar="EFFECT",
+                help="with --explain: in one line why this effect (NAME, or 'NAME at PLACE') is a finding or none",
+            ),
+            argument(
                 "--last",
                 type=int,
                 default=2,
@@ -305,7 +310,7 @@ def diagnose(args: argparse.Namespace) -> int:
     if args.explain:
         from thermoctl.diagnose.show import explained
 
-        return explained(args.explain)
+        return explained(args.explain, args.why)
     for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
         if not value:
             raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")

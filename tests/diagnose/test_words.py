@@ -7,17 +7,25 @@ import json
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.diagnose.report.explain import explain
+from thermoctl.diagnose.report.explain import explain, why
 from thermoctl.diagnose.report.words import sentences, words
 
 LAG = {
+    "confirmed": 0.996,
     "effect": "sensor_lag",
     "where": "reading",
     "when": None,
     "probability": 0.98,
     "parameters": {"TAU_sensor_lag_reading": {"value": 4.21, "sd": 0.1, "unit": "s"}},
 }
-RADIATION = {"effect": "radiation", "where": "block", "when": None, "probability": 1.0, "parameters": {}}
+RADIATION = {
+    "effect": "radiation",
+    "where": "block",
+    "when": None,
+    "probability": 1.0,
+    "confirmed": 0.99,
+    "parameters": {},
+}
 FOUND = {
     "verdict": "partly_explained",
     "findings": [RADIATION, LAG],
@@ -41,6 +49,8 @@ FOUND = {
     "decision": {"row": "findings are supported and a remainder stays beside them", "over_noise": 1.5},
     "hypotheses": [],
     "lost": [],
+    "refused": [{"effects": ["creep at v"], "reason": "refitted, and it or a part of it is not significant"}],
+    "promised": {"radiation at block": 3.21, "cogging at v": 1.25},
     "truncated": True,
     "outputs": {"reading": {"unit": "degC", "noise": 0.02}},
 }
@@ -96,3 +106,16 @@ def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
     assert "--plant FILE is missing" in capsys.readouterr().err
     assert main(["diagnose", "run.csv", "--plant", "plant.yaml"]) == 2
     assert "--out DIR is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("asked", "answer"),
+    [
+        ("sensor_lag", "sensor_lag at reading: a finding, probability 0.980, confirmed with 0.996"),
+        ("creep", "creep at v: refitted, and it or a part of it is not significant"),
+        ("creep at w", "creep at w: it promised nothing in any screening"),
+        ("cogging", "cogging at v: not refitted; to first order it gains at most 1.2 nats"),
+    ],
+)
+def test_one_line_says_why_an_effect_is_a_finding_or_none(asked, answer):
+    assert why(FOUND, asked).startswith(answer)

@@ -81,7 +81,14 @@ def test_the_extended_plant_is_a_plant_file(found, tmp_path):
 def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
     made, d, law = found
     known = d.case
-    result = {"decision": {}, "hypotheses": [], "lost": [], "remainder": {"law": law_entry(law, d.worth)}}
+    result = {
+        "decision": {},
+        "hypotheses": [],
+        "lost": [],
+        "refused": [],
+        "promised": {},
+        "remainder": {"law": law_entry(law, d.worth)},
+    }
     (tmp_path / "diagnosis.json").write_text(json.dumps(result))
     own = tmp_path / "own"
     assert main(["effects", "save", str(tmp_path), "peltier", "--effects", str(own)]) == 0

@@ -144,6 +144,11 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "decision": {"row": d.decision.row, **d.decision.numbers},
             "hypotheses": _hypotheses(d),
             "lost": _lost(d),
+            "refused": [
+                {"effects": [f"{e} at {at}" for e, at in sorted(keys)], "reason": why}
+                for keys, why in d.searched.refused.items()
+            ],
+            "promised": {f"{e} at {at}": gain for (e, at), gain in sorted(d.searched.promised.items())},
             "not_seen": [],
             "truncated": d.searched.truncated,
             "notes": _notes(d),

@@ -32,6 +32,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
 
+INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
 BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
 # Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
@@ -58,14 +59,17 @@ class Weighed:
 class Searched:
     """All hypotheses tried, best first; whether the budget ended the search.
 
-    `norms`: of all columns in the screening without effects; empty where there was none, or only of some.
-    `seen`: hypotheses that were extended; `where`: the places where each effect fits."""
+    `norms`: of all columns in the screening without effects; empty where not all were screened.
+    `seen`: hypotheses that were extended; `where`: the places where each effect fits. `promised`: the
+    largest first-order gain of each placed effect, nats; `refused`: refits that are no hypotheses, and why."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
     norms: Sequence[Norms] = ()
     seen: frozenset[Keys] = frozenset()
     where: Mapping[str, set[str]] = field(default_factory=dict)
+    promised: Mapping[Key, float] = field(default_factory=dict)
+    refused: Mapping[Keys, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -79,6 +83,8 @@ class Search:
     seen: set[Keys] = field(default_factory=set)
     norms: list[Norms] = field(default_factory=list)  # of the screening without effects
     refitted: set[Keys] = field(default_factory=set)  # extensions, kept or not: none is refitted twice
+    promised: dict[Key, float] = field(default_factory=dict)  # largest first-order gain of a placed effect
+    refused: dict[Keys, str] = field(default_factory=dict)  # refits that are no hypotheses: why
 
     @property
     def best(self) -> Weighed:
@@ -104,6 +110,8 @@ class Search:
         looked = screened(self.case, parent.fitted, self.limits)
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
+        for d, gain in zip(looked.directions, looked.promises, strict=True):
+            self.promised[d.candidate.key] = max(gain, self.promised.get(d.candidate.key, 0.0))
         found = extensions(self, parent, looked)
         self.keep(found)
         return found
@@ -135,7 +143,10 @@ def search(case: Case, limits: Limits) -> Searched:
 def searched(s: Search) -> Searched:
     """Return the result of a search."""
     order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
-    return Searched(order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where)
+    refused = {keys: why for keys, why in s.refused.items() if keys not in s.tried}
+    return Searched(
+        order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
+    )
 
 
 def started(case: Case, limits: Limits) -> Search:
@@ -336,6 +347,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         case.budget.planned = case.budget.fits_done + left + len(batch)
         for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
             found = [f for f in fits if not f.absent]
+            s.refused[parent.fitted.hypothesis.keys | {d.candidate.key for d in added}] = INSIGNIFICANT
             if found:
                 best = max(found, key=lambda f: f.log_evidence)
                 w = Weighed(best, odds(best.hypothesis.effects, where, limits))

@@ -11,13 +11,14 @@ from rich.console import Console
 from rich.table import Table
 
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.report.explain import explain
+from thermoctl.diagnose.report.explain import explain, why
 from thermoctl.yamlfile import InputError, suggest
 
 
-def explained(folder: str) -> int:
-    """Print the reasons of the diagnosis in a folder. Raises InputError where there is none."""
-    print(explain(read(Path(folder))))
+def explained(folder: str, effect: str | None = None) -> int:
+    """Print the reasons of a diagnosis, or those of one effect. Raises InputError where there is none."""
+    found = read(Path(folder))
+    print(why(found, effect) if effect else explain(found))
     return 0
 
 
@@ -73,6 +74,9 @@ def read(folder: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
     except ValueError as e:
         raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
-    if not isinstance(found, dict) or not {"decision", "hypotheses", "lost"} <= found.keys():
+    if (
+        not isinstance(found, dict)
+        or not {"decision", "hypotheses", "lost", "refused", "promised"} <= found.keys()
+    ):
         raise InputError(f"{path}: written by an older version, without its reasons; diagnose again")
     return found

@@ -29,7 +29,10 @@ def with_laws(
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     A plant that leaves only noise needs none."""
-    s = Search(case, limits, found.where, {w.fitted.hypothesis.keys: w for w in found.tried}, set(found.seen))
+    tried = {w.fitted.hypothesis.keys: w for w in found.tried}
+    s = Search(case, limits, found.where, tried, set(found.seen), list(found.norms))
+    s.promised, s.refused = dict(found.promised), dict(found.refused)
+    s.refitted = {*tried, *s.refused}
     for parent in (s.tried[frozenset()], s.best):
         if case.budget.stopped() or only_noise(case, parent.fitted, limits):
             continue

@@ -33,3 +33,33 @@ def explain(found: Mapping[str, Any]) -> str:
     lines.append(f"hypotheses not shown: {max(rest, 0)} (in diagnosis.json){budget}")
     lines.append(f"what next: {what_next(found)}")
     return "\n".join(lines)
+
+
+def why(found: Mapping[str, Any], asked: str) -> str:
+    """Return in one line why an effect, `NAME` or `NAME at PLACE`, is a finding or none."""
+
+    def is_asked(entry: str) -> bool:
+        """Return whether an `effect at place` is the one that was asked for."""
+        return asked in (entry, entry.partition(" at ")[0])
+
+    for f in found["findings"]:
+        if is_asked(name := f"{f['effect']} at {f['where']}"):
+            return (
+                f"{name}: a finding, probability {f['probability']:.3f}, confirmed with {f['confirmed']:.3f}"
+            )
+    for e in found["lost"]:
+        if is_asked(name := f"{e['effect']} at {e['where']}"):
+            beside = f" beside {' and '.join(e['beside'])}" if e["beside"] else ""
+            return (
+                f"{name}: refitted{beside}; {e['reason']} (probability {e['probability']:.3f}, "
+                f"{e['below_best']:.1f} nats below the result)"
+            )
+    for r in found["refused"]:
+        for name in filter(is_asked, r["effects"]):
+            beside = " and ".join(e for e in r["effects"] if e != name)
+            return f"{name}: {r['reason']}{f', beside {beside}' if beside else ''}"
+    promised = {name: gain for name, gain in found["promised"].items() if is_asked(name)}
+    if promised:
+        name = max(promised, key=lambda n: promised[n])
+        return f"{name}: not refitted; to first order it gains at most {promised[name]:.1f} nats, others promised more"
+    return f"{asked}: it promised nothing in any screening, or has no place in this plant (`thermoctl effects` lists names)"
