@@ -61,7 +61,7 @@ class Searched:
 
     `norms`: of all columns in the screening without effects; empty where not all were screened.
     `seen`: hypotheses that were extended; `where`: the places where each effect fits. `promised`: the
-    largest first-order gain of each placed effect, nats; `refused`: refits that are no hypotheses, and why."""
+    largest first-order gain of a placed effect, nats; `refused`: refits that are no hypotheses, and why."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
