@@ -172,6 +172,8 @@ def _separator(
     """Return the separator that gives lines of one width and most numbers."""
     best: tuple[float, str, list[tuple[int, list[str]]]] | None = None
     for separator in candidates:
+        if not separator.strip(" ") and best is not None and best[0] >= 0.3:  # noqa: PLR2004
+            break  # blanks inside the cells of another separator
         try:
             rows = [(n, cells_of(line, separator)) for n, line in sample]
         except csv.Error:
