@@ -28,7 +28,11 @@ def with_laws(
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
-    A plant that leaves only noise needs none."""
+    A plant that leaves only noise needs none. Nor does one effect that leaves only noise: a law is rarer than
+    it, and cannot fit better."""
+    best = found.tried[0].fitted
+    if len(best.hypothesis.effects) <= 1 and only_noise(case, best, limits):
+        return found
     tried = {w.fitted.hypothesis.keys: w for w in found.tried}
     s = Search(case, limits, found.where, tried, set(found.seen), list(found.norms))
     s.promised, s.refused = dict(found.promised), dict(found.refused)
