@@ -14,17 +14,20 @@ from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 
 LAW = [
+    "where",
     "expression",
     "part",
     "terms",
+    "forms",
     "memory",
-    "variables",
+    "of",
     "parameters",
     "probability",
+    "confirmed",
     "gain",
     "rms",
     "share_closed",
-    "family",
+    "equivalent",
     "effect",
 ]
 LOST = ("effect", "where", "beside", "probability", "below_best", "reason")

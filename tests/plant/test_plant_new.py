@@ -63,7 +63,7 @@ def test_a_strangers_rig_in_ten_minutes(folder, capsys):
 
     command("plant new rig.yaml --from-csv log.csv")
     printed = capsys.readouterr()
-    assert "time taken from column 'Zeit'" in printed.err and "decimal comma" in printed.err
+    assert "time from 'Zeit'" in printed.err and "decimal comma" in printed.err
     assert "it heats 'Block'" in printed.out and "touch" in printed.out
     plant = load("rig.yaml")
     assert list(plant.inputs) == ["P_Heizung", "T_Luft"] and list(plant.nodes) == ["Block", "Kuehler"]

@@ -75,11 +75,15 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect that the plant lacks. `parameters`: value, sd and unit by name; `when`: intervals."""
+    """One effect that the plant lacks.
+
+    `confirmed`: probability that it predicts what it was not fitted to. `parameters`: value, sd and unit by
+    name; `when`: intervals."""
 
     effect: str
     where: str
     probability: float
+    confirmed: float
     equation: str
     parameters: Mapping[str, Mapping[str, Any]]
     summary: str

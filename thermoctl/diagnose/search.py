@@ -313,12 +313,13 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
     A promise is the first-order gain. An extension that would not reach the leader with twice its promise is
-    left out. Beside a leader that leaves no more than noise, its promise counts once."""
+    left out; all promises are taken for too small by the largest `ratio` so far. Beside a leader that leaves
+    no more than noise only promises count."""
     case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
     quiet: dict[Keys, bool] = {}  # does a leader leave no more than noise?
-    queue, planned = shortlist(looked, where, limits), case.budget.later
+    queue, planned, ratio = shortlist(looked, where, limits), case.budget.later, 1.0
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
@@ -330,9 +331,9 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         own = ahead.fitted.hypothesis.keys
         if own not in quiet:
             quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        if quiet[own] and (np.isinf(gain) or parent.score + gain < ahead.score):
+        if quiet[own] and np.isinf(gain):
             return False
-        if parent.score + HALF * gain < ahead.score:
+        if parent.score + HALF * ratio * gain < ahead.score:
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
@@ -347,6 +348,9 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         case.budget.planned = case.budget.fits_done + left + len(batch)
         for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
             found = [f for f in fits if not f.absent]
+            if np.isfinite(gain):
+                best_gain = max((f.log_evidence for f in fits), default=-np.inf) - parent.fitted.log_evidence
+                ratio = max(ratio, best_gain / max(gain, 1.0))
             s.refused[parent.fitted.hypothesis.keys | {d.candidate.key for d in added}] = INSIGNIFICANT
             if found:
                 best = max(found, key=lambda f: f.log_evidence)
