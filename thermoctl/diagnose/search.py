@@ -313,7 +313,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
     A promise is the first-order gain. An extension that would not reach the leader with twice its promise is
-    left out; all promises are taken for too small by the largest `ratio` so far. Beside a leader that leaves
+    left out. All promises are taken for too small by the largest `ratio` so far. Beside a leader that leaves
     no more than noise only promises count."""
     case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
