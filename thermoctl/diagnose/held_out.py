@@ -136,7 +136,8 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
                 model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
             )
             for r, t in enumerate(case.tables):
-                d = model.excitation(_masked(t, measured, 1 - parity, False))
+                aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
+                d = dataclasses.replace(drives[r], y=aside)  # its start is that of the whole recording
                 errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
         except SimulationError:
             errors += [np.full((len(t), len(model.outputs)), np.nan) for t in case.tables]
