@@ -82,6 +82,19 @@ def test_every_kind_of_data_gives_the_same(plant, frames):
         assert np.allclose(tc.simulate(plant, data).outputs["temperature_2"], expected, atol=1e-9)
 
 
+def test_a_file_is_read_as_its_options_say(tmp_path, frames):
+    path = tmp_path / "run.csv"
+    path.write_text('time,T\n0,"1,100"\n1,-9999\n2,"1,200"\n')
+    table = tc.read(path, decimal=",", missing=[-9999])
+    np.testing.assert_array_equal(table.columns["T"], [1.1, np.nan, 1.2])
+    frames[0].to_excel(tmp_path / "run.xlsx", sheet_name="second", index=False)
+    assert len(tc.read(tmp_path / "run.xlsx", sheet="second").t) == len(frames[0])
+    with pytest.raises(InputError, match="other"):
+        tc.read(tmp_path / "run.xlsx", sheet="other")
+    with pytest.raises(InputError, match="decimal: a file was expected"):
+        tc.read(frames[0], decimal=",")
+
+
 def test_unusable_data_is_one_clear_error(plant, frames):
     frame = frames[0]
     for data, expected in (

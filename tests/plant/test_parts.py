@@ -1,8 +1,12 @@
 """A recording with a gap is read as parts, each with a start of its own; a jump of the clock is named."""
 
+import warnings
+
 import numpy as np
 import pytest
 
+import thermoctl as tc
+from thermoctl.cli import main
 from thermoctl.plant.files import loads
 from thermoctl.plant.parts import in_parts
 from thermoctl.plant.refit import fit
@@ -74,3 +78,47 @@ def test_an_unknown_state_after_a_gap_leaves_the_rest_out():
     )
     (part,) = in_parts(plant, run(missing=(400, 600)))
     assert part.t[-1] < 400 and any("nothing states where 'one' starts" in n for n in part.notes)
+
+
+@pytest.mark.filterwarnings("ignore:.*each with a start of its own")
+def test_python_splits_at_a_gap_too():
+    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    table = run(missing=(400, 600))
+    frame = {"t": table.t, **table.columns}
+    with pytest.warns(UserWarning, match="no samples from t = 398 to 600 s"):
+        known = tc.refit(plant, frame)
+    assert known.plant.parameters["C"] == pytest.approx(100, rel=0.02) and known.rms["T"] < 0.06
+    again = tc.simulate(known.plant, frame, x0={"one": 22.0})
+    np.testing.assert_array_equal(again.t, table.t)
+    assert again.states["one"][0] == 22 and again.rms["T"] < 0.1
+    assert again.states["one"][200] == pytest.approx(table.columns["T"][200])
+    ahead = tc.simulate(known.plant, frame, x0=frame)
+    assert ahead.states["one"][0] == pytest.approx(table.columns["T"][-1], abs=0.2)
+    found = tc.diagnose(plant, frame).json
+    assert found["verdict"] == "consistent" and not found["findings"]
+    assert found["fit"]["held_out_refit_only"]["T"] < 0.06
+
+
+def test_inputs_alone_are_a_schedule():
+    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    t = np.array([*range(20), 500.0, 1000.0])
+    inputs = {"t": t, "heat": np.where(t < 10, 5.0, 0.0), "air": np.full(len(t), 22.0)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free = tc.simulate(plant, inputs)
+    assert len(free.t) == len(t) and free.states["one"][-1] < 22.1
+
+
+def test_simulate_starts_each_part_by_its_readings(tmp_path, capsys):
+    table = run(missing=(400, 600))
+    rows = np.column_stack([table.t, *table.columns.values()])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="t,heat,air,T", comments="")
+    (tmp_path / "plant.yaml").write_text(
+        PLANT.replace("C: {value: 80", "C: {value: 100").replace("0.3, u", "0.2, u")
+    )
+    given = ["simulate", "--plant", str(tmp_path / "plant.yaml"), str(tmp_path / "run.csv")]
+    assert main([*given, "--out", str(tmp_path / "out.csv")]) == 0
+    later = np.genfromtxt(tmp_path / "out_run_part2.csv", delimiter=",", names=True)
+    assert later["one_state"][0] == pytest.approx(table.columns["T"][200], abs=1e-6)
+    assert main([*given, "--initial", str(tmp_path / "run.csv")]) == 0
+    assert "the end of" in capsys.readouterr().out

@@ -16,7 +16,7 @@ import numpy as np
 from thermoctl.api.data import Data, tables_of
 from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
-from thermoctl.api.results import Diagnosis, Simulation
+from thermoctl.api.results import Diagnosis, Simulation, joined
 from thermoctl.checks import Finding, checks
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.diagnosis import diagnose as _diagnose
@@ -36,11 +36,26 @@ def load_plant(source: str | Path | Mapping[str, Any], map: str | Path | None = 
     return Plant(from_plain(source) if isinstance(source, Mapping) else load(source, map))
 
 
-def read(data: Data, time: str | None = None, columns: Mapping[str, str] | None = None) -> Table:
-    """Return a recording of any kind of data: `t` (N,) in seconds, `columns` (N,) each, `units`.
+def read(
+    data: Data,
+    time: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    *,
+    sheet: str | None = None,
+    missing: Sequence[str] = (),
+    decimal: str | None = None,
+) -> Table:
+    """Return a recording of any kind of data: `t` (N,) in seconds, `columns` (N,) each, `units`, `notes`.
 
-    `time`: the column of times; `columns`: name that a plant reads: name in the data. Raises InputError."""
-    return tables_of(None, data, time, columns)[0]
+    `time`: the column of times; `columns`: name that a plant reads: name in the data. Raises InputError.
+
+    Of a file only:
+
+    - `sheet`: sheet of Excel, group of TDMS, variable of MATLAB
+    - `missing`: further words and numbers for "no value"
+    - `decimal`: the decimal sign"""
+    how = {"sheet": sheet, "missing": tuple(map(str, missing)), "decimal": decimal}
+    return tables_of(None, data, time, columns, **{k: v for k, v in how.items() if v})[0]
 
 
 def simulate(
@@ -53,14 +68,17 @@ def simulate(
 
     `parameters`: values that replace the plant's. `x0`: initial values by node, "steady" for the steady state
     of the first inputs, or a recording, whose last state is estimated. By default the plant file decides, and
-    the steady state where it needs readings that `data` lacks."""
+    the steady state where it needs readings that `data` lacks. After a gap a run starts from its readings."""
     own = plant_of(plant)
     model = compile_plant(own.description, ())
-    (table,) = tables_of(own.description, data)
-    excitation = model.excitation(table)
-    with_start(model, excitation, _start(own, x0), parameters)
+    parts, start = tables_of(own.description, data), _start(own, x0)
+    drives, runs = [], []
     try:
-        return Simulation(own, excitation, model.run(excitation, parameters))
+        for part in parts:
+            drives.append(model.excitation(part))
+            with_start(model, drives[-1], start, parameters)
+            runs.append(model.run(drives[-1], parameters))
+        return joined(own, drives, runs, [float(p.t[0] - parts[0].t[0]) for p in parts])
     except SimulationError as e:
         raise InputError(f"{own.description.file}: {e}") from None
 
@@ -73,8 +91,7 @@ def _start(plant: Plant, x0: Mapping[str, float] | Data | None) -> Mapping[str, 
         or (isinstance(x0, Mapping) and all(np.ndim(v) == 0 for v in x0.values()))
     ):
         return x0
-    (table,) = tables_of(plant.description, x0)
-    return last_state(plant.description, table)
+    return last_state(plant.description, tables_of(plant.description, x0)[-1])
 
 
 def refit(plant: Plant | str | Path, data: Data | Sequence[Data], tries: int = 0) -> Refit:

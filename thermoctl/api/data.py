@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from thermoctl.plant.language import Plant
+from thermoctl.plant.parts import in_parts
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
@@ -36,18 +38,37 @@ def tables_of(
     data: Data | Sequence[Data],
     time: str | None = None,
     columns: Mapping[str, str] | None = None,
+    **how: Any,
 ) -> list[Table]:
-    """Return one recording or several, in the plant's units. Raises InputError."""
+    """Return one recording or several, in the plant's units; one with a gap in parts, with a warning.
+
+    `how`: see `logger.How`; of files only. Raises InputError."""
     items: Sequence[Any] = data if isinstance(data, list | tuple) else [data]
-    found = [_table(item, f"data_{k + 1}", time, columns) for k, item in enumerate(items)]
-    return [in_plant_units(plant, t) for t in found] if plant else found
+    found = [_table(item, f"data_{k + 1}", time, columns, how) for k, item in enumerate(items)]
+    return [part for table in found for part in _parts(plant, table)] if plant else found
 
 
-def _table(data: Data, name: str, time: str | None, columns: Mapping[str, str] | None) -> Table:
-    if isinstance(data, Table):
-        return data
+def _parts(plant: Plant, table: Table) -> list[Table]:
+    table = in_plant_units(plant, table)
+    parts = in_parts(plant, table)
+    for note in parts[0].notes[len(table.notes) :]:
+        warnings.warn(f"{table.path}: {note}", stacklevel=5)
+    return parts
+
+
+def _table(
+    data: Data, name: str, time: str | None, columns: Mapping[str, str] | None, how: Mapping[str, Any]
+) -> Table:
     if isinstance(data, str | Path):
-        return read_recording(data, time, columns)
+        return read_recording(data, time, columns, **how)
+    if how:
+        raise InputError(f"{name}: {', '.join(how)}: a file was expected; change the data frame instead")
+    return data if isinstance(data, Table) else _of_frame(data, name, time, columns)
+
+
+def _of_frame(
+    data: Mapping[str, Any] | Frame, name: str, time: str | None, columns: Mapping[str, str] | None
+) -> Table:
     arrays = {str(c): data[c] for c in (data if isinstance(data, Mapping) else data.columns)}
     for wanted, given in (columns or {}).items():
         if given not in arrays:
@@ -72,7 +93,9 @@ def _table(data: Data, name: str, time: str | None, columns: Mapping[str, str] |
     return Table(name, name, t, values, units=units, recorded=True)
 
 
-def _times(data: Data, arrays: dict[str, Any], time: str | None, name: str) -> tuple[np.ndarray, str]:
+def _times(
+    data: Mapping[str, Any] | Frame, arrays: dict[str, Any], time: str | None, name: str
+) -> tuple[np.ndarray, str]:
     """Take the column of times out of `arrays`; a pandas frame's index serves without one."""
     key = time or next((k for k in _TIMES if k in arrays), None)
     if key is not None and key not in arrays:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import json
 from collections.abc import Mapping, Sequence
@@ -71,6 +72,19 @@ class Simulation:
     def plot(self) -> Figure:
         """Return measured and simulated outputs over time."""
         return over_time(self.plant.description, self.excitation, {"simulated": self.run.y})
+
+
+def joined(
+    plant: Plant, drives: Sequence[Excitation], runs: Sequence[Run], begins: Sequence[float]
+) -> Simulation:
+    """Return the runs of a recording's parts, which begin at `begins`, s, as one."""
+    t = np.concatenate([d.t + b for d, b in zip(drives, begins, strict=True)])
+    whole = dataclasses.replace(
+        drives[0], t=t, u=np.concatenate([d.u for d in drives]), y=np.concatenate([d.y for d in drives])
+    )
+    return Simulation(
+        plant, whole, Run(t, np.concatenate([r.x for r in runs]), np.concatenate([r.y for r in runs]))
+    )
 
 
 @dataclass(frozen=True)

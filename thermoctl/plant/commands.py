@@ -94,8 +94,7 @@ def _initial(plant: Plant, args: argparse.Namespace) -> Mapping[str, float] | st
     if args.initial is None or args.initial == "steady":
         return None if args.initial is None else "steady"
     if "=" not in args.initial or Path(args.initial).exists():
-        (table,) = _read(plant, [args.initial], args)
-        state = last_state(plant, table)
+        state = last_state(plant, _read(plant, [args.initial], args)[-1])
         print(f"start: {', '.join(f'{n} = {v:.5g}' for n, v in state.items())} (the end of {args.initial})")
         return state
     values = {}

@@ -29,6 +29,7 @@ def with_start(
 
     `wanted`: values by node, in the nodes' units; "steady"; None for the plant's own expressions. A node
     whose expression needs a reading that the recording lacks starts in the steady state of the first inputs.
+    A part after a gap starts from its own first readings in any case.
     Raises InputError for an unknown node, and where there is no steady state."""
     values = {} if wanted is None or isinstance(wanted, str) else dict(wanted)
     for node in values:
@@ -37,10 +38,14 @@ def with_start(
                 f"initial value of '{node}': {model.plant.file} has no such node"
                 f"{suggest(node, model.states)}; the nodes are {', '.join(model.states)}"
             )
+    x0 = np.array([values.get(n, np.nan) for n in model.states])
+    if excitation.x0 is not None:
+        x0 = excitation.x0.copy()
+        wanted, values = None, dict(zip(model.states, x0, strict=True))
+        values = {n: v for n, v in values.items() if np.isfinite(v)}
     lacking = [
         n for n in model.states if n not in values and (wanted == "steady" or _lacks(model, n, excitation))
     ]
-    x0 = np.array([values.get(n, np.nan) for n in model.states])
     if lacking:
         calm = _steady(model, excitation, x0, parameters)
         for n in lacking:

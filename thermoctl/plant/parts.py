@@ -41,7 +41,12 @@ def gaps(t: np.ndarray) -> np.ndarray:
 
 
 def in_parts(plant: Plant, table: Table) -> list[Table]:
-    """Return a recording as the parts between its gaps, or as it is. Each cut is a note."""
+    """Return a recording as the parts between its gaps, or as it is. Each cut is a note.
+
+    Inputs alone are a schedule: they hold between its rows, however far apart."""
+    measured = [table.columns[o.column] for o in plant.outputs.values() if o.column in table.columns]
+    if not any(np.isfinite(y).any() for y in measured):
+        return [table]
     found = gaps(table.t)
     moving = [i.column for i in plant.inputs.values() if _moves(table, i.column)]
     jumps = [k for k in found.tolist() if moving or _goes_on(plant, table, k)]
