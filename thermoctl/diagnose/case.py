@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnose.catalogue import Effect
-from thermoctl.diagnose.coordinates import Coordinates
+from thermoctl.diagnose.coordinates import FEWEST, Coordinates
 from thermoctl.diagnose.grids import Grid, grid
 from thermoctl.diagnose.memory import NOTHING, Memory
 from thermoctl.diagnose.progress import Pace
@@ -30,6 +30,7 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 LEAST = 40  # measured values of one output, below which nothing is decided
+STATED = 12  # the same where the plant file states the noise, which then is not estimated from them
 ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
@@ -144,12 +145,7 @@ def case(
     tables = fewer.tables
     model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
-    counts = [sum(int(np.isfinite(d.y[:, j]).sum()) for d in drives) for j in range(len(model.outputs))]
-    if max(counts, default=0) < LEAST:
-        raise InputError(
-            f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts, default=0)} measured values of one "
-            f"output ({', '.join(o.column for o in plant.outputs.values())}); {LEAST} or more are needed"
-        )
+    _enough(model, drives, ", ".join(t.path for t in tables))
     noise = fewer.noise(plant, drives)
     rtol = _rtol(drives, noise)
     for d in drives:
@@ -182,6 +178,22 @@ def case(
         off,
         rtol,
         memory,
+    )
+
+
+def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
+    """Raise InputError where no output has enough measured values, in recordings with FEWEST or more."""
+    outputs = list(model.plant.outputs.values())
+    measured = np.array([np.isfinite(d.y).sum(axis=0) for d in drives])
+    counts = np.where(measured >= FEWEST, measured, 0).sum(axis=0)
+    stated = [bool(o.noise_sd or o.resolution) for o in outputs]
+    over = counts.sum() >= 2 * (len(model.active) + len(drives) * len(model.uncertain))
+    if any(n >= (STATED if known and over else LEAST) for n, known in zip(counts, stated, strict=True)):
+        return
+    raise InputError(
+        f"{paths}: too little data: at most {max(counts, default=0)} measured values of one output "
+        f"({', '.join(o.column for o in outputs)}) in recordings of {FEWEST} or more; {LEAST} are needed, or {STATED} where "
+        "the plant file states the output's noise and all outputs have twice as many values as there are unknowns"
     )
 
 

@@ -1,0 +1,59 @@
+"""Few samples are enough where the plant file states the noise; else the error says how many are needed."""
+
+import numpy as np
+import pytest
+
+import thermoctl as tc
+from thermoctl.plant.files import loads
+from thermoctl.yamlfile import InputError
+
+PLANT = """format: thermoctl-plant/1
+inputs:
+  heat: {unit: W}
+  air: {unit: degC}
+parameters:
+  C: {value: 80, unit: J/K, range: [20, 300]}
+  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
+nodes:
+  one: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: one, rate: heat, unit: W}
+  loss: {from: one, rate: G * (one - air), unit: W}
+outputs:
+  T: {value: one, unit: degC, noise: 0.05}
+"""
+
+
+def run(count, extra_w=0.0):
+    """Return a recording of 1200 s of 100 J/K and 0.2 W/K, with a source of `extra_w` from 600 s on."""
+    t = np.linspace(0.0, 1200.0, count)
+    heat = np.where(t < 400, 10.0, 0.0) + np.where(t >= 800, 5.0, 0.0)
+    one = np.full(count, 22.0)
+    for k in range(count - 1):
+        begin = one[k]
+        for m in np.linspace(t[k], t[k + 1], 201)[:-1]:
+            source = heat[k] + extra_w * (m > 600) - 0.2 * (begin - 22.0)
+            begin += source * (t[k + 1] - t[k]) / 200 / 100.0
+        one[k + 1] = begin
+    noise = 0.05 * np.random.default_rng(1).standard_normal(count)
+    return {"t": t, "heat": heat, "air": np.full(count, 22.0), "T": one + noise}
+
+
+@pytest.mark.parametrize("count", [12, 20])
+def test_few_samples_of_stated_noise_are_enough(count):
+    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    assert tc.diagnose(plant, run(count)).verdict == "consistent"
+    found = tc.diagnose(plant, run(count, extra_w=2.0))
+    assert found.verdict != "consistent"
+    assert {f.effect for f in found.findings} <= {"external_heat_source"}
+
+
+def test_of_unknown_noise_more_are_needed():
+    unknown = tc.Plant(loads(PLANT.replace(", noise: 0.05", ""), "plant.yaml"))
+    for plant, data in (
+        (unknown, run(20)),
+        (tc.Plant(loads(PLANT, "plant.yaml")), run(11)),
+        (tc.Plant(loads(PLANT, "plant.yaml")), [run(7), run(7)]),
+    ):
+        with pytest.raises(InputError, match="too little data: .* 40 are needed, or 12 where"):
+            tc.diagnose(plant, data)
