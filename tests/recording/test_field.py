@@ -1,6 +1,8 @@
 """What a file says: the clock by evidence, cells in every spelling, damage at its end; nothing is dropped in silence."""
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from thermoctl.recording.logger import read_recording
@@ -167,3 +169,21 @@ def test_equal_seconds_are_a_choice(tmp_path, choice, t, x):
         read(tmp_path, text)
     found = read(tmp_path, text, equal_times=choice)
     assert found.t.tolist() == t and found.columns["T"].tolist() == x
+
+
+def test_a_header_that_lacks_a_name(tmp_path):
+    with pytest.raises(InputError, match=r":1: 2 names, 3 cells in the rows below"):
+        read(tmp_path, table("time,T", "0,20,5", "1,21,5", "2,22,5"))
+    found = read(tmp_path, table("time,T", "1,0,20", "2,0.5,21", "3,1,22"))
+    assert found.t.tolist() == [0, 0.5, 1] and found.columns["T"].tolist() == [20, 21, 22]
+    assert any("lacks the first column's name" in n for n in found.notes)
+    found = read(tmp_path, table("T,P", *(f"{ISO}{i},2{i},{i}" for i in range(3))))
+    assert found.t.tolist() == [0, 1, 2] and found.columns["P"].tolist() == [0, 1, 2]
+
+
+def test_names_of_parquet_state_units_as_those_of_a_text(tmp_path):
+    path = tmp_path / "run.parquet"
+    columns = {"time [ms]": [0, 500, 1000], "P (mW)": [1.0, 2, 3], "T": [20.0, 21, 22]}
+    pq.write_table(pa.table(columns), path)
+    found = read_recording(path)
+    assert found.t.tolist() == [0, 0.5, 1] and found.units == {"P": "mW"} and "P" in found.columns

@@ -278,7 +278,10 @@ def _header(
     while len(lines_of) > 1 and below and sum(bool(c) for c in lines_of[-1][1]) < width / 2:
         lines_of.pop()
     line, cells = lines_of[-1]
+    short = len(cells) == width - 1
     cells = _widened(cells, width, data)
+    if short and not cells[0]:
+        _index(path, line, width, data, notes)
     split = [split_words(c) for c in cells]
     names = [n for n, _ in split]
     # Two columns that differ by their units only keep them in their names.
@@ -342,6 +345,18 @@ def _widened(cells: list[str], width: int, data: list[list[str]]) -> list[str]:
             return [cells[0], f"{cells[0]} of day", *cells[1:]]
         return [*cells, ""] if empty else ["", *cells]
     return cells + [""] * (width - len(cells))
+
+
+def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list[str]) -> None:
+    """Note a first column without a name. Raises InputError where it may be another that lacks its name.
+
+    Dates, words, and row numbers from 1 (R writes those) are an index."""
+    first = [row[0] for row in data]
+    if all(map(is_number, first)) and first != [str(i) for i in range(1, len(first) + 1)]:
+        raise InputError(
+            f"{path}:{line}: {width - 1} names, {width} cells in the rows below; add the name that lacks to the header"
+        )
+    notes.append("the header has one name less than the rows have cells: it lacks the first column's name")
 
 
 def _distinct(path: Path, line: int, names: list[str], data: list[list[str]]) -> list[str]:

@@ -40,7 +40,7 @@ from thermoctl.recording.dialect import (
 )
 from thermoctl.recording.sheet import Cells, Sheet
 from thermoctl.recording.table import Table
-from thermoctl.recording.units import split_unit
+from thermoctl.recording.units import split_unit, split_words
 from thermoctl.yamlfile import InputError, suggest
 
 HEAD = 65536  # bytes that decide whether a file is one of ours
@@ -209,7 +209,7 @@ def _sheets(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     kind = _kind(path)
     how.trace.append(f"format: {kind}")
     if kind in _READERS:
-        return _READERS[kind](path, how, notes)
+        return [_of_names(s) for s in _READERS[kind](path, how, notes)]
     if kind == "xls":
         raise InputError(f"{path}: an Excel file of before 2007; save it as .xlsx or .csv")
     if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
@@ -225,6 +225,18 @@ def _sheets(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     text, said = decoded(path, data)
     notes += said
     return _text(path, text, how, notes)
+
+
+def _of_names(sheet: Sheet) -> Sheet:
+    """Return a sheet with the units that its columns' names state, such as 'P (mW)', as those of a text."""
+    split = {n: split_words(n) for n in sheet.columns}
+    plain = [name for name, _ in split.values()]
+    names = {
+        n: name if unit and n not in sheet.units and plain.count(name) == 1 else n
+        for n, (name, unit) in split.items()
+    }
+    units = sheet.units | {names[n]: unit for n, (_, unit) in split.items() if unit and names[n] != n}
+    return replace(sheet, columns={names[n]: c for n, c in sheet.columns.items()}, units=units)
 
 
 def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
