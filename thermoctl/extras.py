@@ -8,7 +8,13 @@ from typing import Any
 from thermoctl.yamlfile import InputError
 
 EXTRAS = {
-    "rig": {"serial": "pyserial", "can": "python-can", "canopen": "canopen", "cantools": "cantools"},
+    "rig": {
+        "serial": "pyserial",
+        "can": "python-can",
+        "pymodbus": "pymodbus",
+        "canopen": "canopen",
+        "cantools": "cantools",
+    },
     "ethercat": {"pysoem": "pysoem"},
     "report": {"matplotlib": "matplotlib"},
     "formats": {

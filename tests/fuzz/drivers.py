@@ -306,6 +306,7 @@ class Module(Fuzzed):
 
     rate_hz = 10.0
     batch = 1
+    head = 1  # bytes of a request before its PDU
 
     def __init__(self) -> None:
         self.answers: list[Callable[[bytes], bytes]] = []
@@ -329,7 +330,13 @@ class Module(Fuzzed):
         return self.answers.pop(0)(request) if self.answers else b""
 
     def good(self) -> Callable[[bytes], bytes]:
-        return lambda request: self.whole(request, struct.pack(">BB9H", 4, 18, 215, *range(8)))
+        """Answer what is asked: after answers that refuse a gap the driver asks for smaller blocks."""
+
+        def make(request: bytes) -> bytes:
+            function, _, count = struct.unpack_from(">BHH", request, self.head)
+            return self.whole(request, struct.pack(f">BB{count}H", function, 2 * count, *[215] * count))
+
+        return make
 
     def frame(self, r: random.Random) -> Callable[[bytes], bytes]:
         seed, kind = r.randrange(1 << 30), r.randrange(10)
@@ -358,6 +365,8 @@ class Module(Fuzzed):
 
 class ModuleOnTcp(Module):
     """Over TCP."""
+
+    head = 7
 
     def listen(self) -> str:
         server = socket.create_server(("127.0.0.1", 0))

@@ -12,6 +12,7 @@ from thermoctl.cli import main
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table
+from thermoctl.recording.logger import read_recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs/examples/heater"
 
@@ -42,7 +43,7 @@ def test_a_foreign_recording_is_held_against_the_plant_as_a_csv_is(suffix, tmp_p
     csv = read_table(EXAMPLE / "run_1.csv")
     path = tmp_path / f"run_1{suffix}"
     write(path, csv.t, csv.columns)
-    foreign, ours = (model.excitation(t) for t in (read_table(path), csv))
+    foreign, ours = (model.excitation(t) for t in (read_recording(path), csv))
     for name in ("t", "u", "y"):
         assert np.allclose(getattr(foreign, name), getattr(ours, name), rtol=0, atol=1e-9)
     said = []

@@ -6,6 +6,9 @@ Ports: "tcp:host:port" (Modbus TCP), "rtu:/dev/serial/by-id/..." (a serial line)
     TCP     transaction id, 0, length (uint16 each), unit, PDU      the answer repeats id, unit and function
     RTU     unit, PDU, CRC                                          the answer repeats unit and function
 
+Messages and frames are pymodbus'; no other module uses it. Its client gives up on bytes that real devices
+send beside an answer, so connections are ours.
+
 Bytes that arrived before a request, such as a late answer, are dropped. A server that closes the connection
 after an answer is connected again for the next request. One that is silent after connecting gets more
 time at each connection before it is asked. On a serial line the echo of the request and bytes before the
@@ -23,15 +26,31 @@ import threading
 import time
 from dataclasses import dataclass
 
+from pymodbus import ModbusException
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ModbusPDU
+from pymodbus.pdu.bit_message import ReadCoilsRequest, ReadDiscreteInputsRequest, WriteSingleCoilRequest
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
 from thermoctl_hal.serial.line import NETWORK, open_port
 
-FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
-"""Modbus function code that reads a kind."""
+READERS: dict[str, type[ModbusPDU]] = {
+    "coil": ReadCoilsRequest,
+    "discrete": ReadDiscreteInputsRequest,
+    "holding": ReadHoldingRegistersRequest,
+    "input": ReadInputRegistersRequest,
+}
+"""The request that reads a kind."""
 BITS = ("coil", "discrete")
-WRITE_COIL, WRITE_SEVERAL, COIL_ON = 5, 16, 0xFF00
+WRITE_COIL, WRITE_SEVERAL = 5, 16
 REFUSAL = 0x80  # bit of the function code of an exception
 MIN_RTU, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
 HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
@@ -78,6 +97,8 @@ class Link:
         self._answered = False
         self._free_s = 0.0  # an RTU frame may begin from then on
         self._is_rtu = port.startswith("rtu:")
+        self._decoder = DecodePDU(False)
+        self._framer = (FramerRTU if self._is_rtu else FramerSocket)(self._decoder)
         self._network = _PORT.fullmatch(port)
         if self._network is None and (not self._is_rtu or port.startswith(f"rtu:{NETWORK}")):
             raise HardwareError(
@@ -115,42 +136,45 @@ class Link:
 
         Raises NoAnswer, or HardwareError when the link is gone."""
         size = -(-count // 8) if kind in BITS else 2 * count
-        answer = self._ask(struct.pack(">BHH", FUNCTIONS[kind], address, count), unit, timeout_s)
+        answer = self._ask(READERS[kind](dev_id=unit, address=address, count=count), timeout_s)
         if answer[0] & REFUSAL:
             return answer[1]
-        data = answer[2:]
-        if answer[1] != size or len(data) != size:
+        if answer[1] != size or len(answer) != 2 + size:
             raise NoAnswer(
-                f"wrong length: {len(data)} bytes of data were answered, {size} were asked for: check 'type' and "
+                f"wrong length: {len(answer) - 2} bytes of data were answered, {size} were asked for: check 'type' and "
                 "'max_block'"
             )
-        if kind in BITS:
-            return [data[k // 8] >> k % 8 & 1 for k in range(count)]
-        return list(struct.unpack(f">{count}H", data))
+        try:
+            found = self._decoder.decode(answer)
+        except (ModbusException, struct.error, IndexError) as e:
+            raise NoAnswer(f"no valid answer: {answer[:SHOWN].hex(' ')} ({e})") from None
+        assert found is not None
+        return [int(b) for b in found.bits[:count]] if kind in BITS else list(found.registers)
 
     def write(self, function: int, address: int, words: list[int], unit: int, timeout_s: float) -> int:
         """Write a coil (5), a register (6) or registers (16); return 0, or the exception code.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
-        pdu = struct.pack(">BH", function, address)
-        if function == WRITE_SEVERAL:
-            pdu += struct.pack(f">HB{len(words)}H", len(words), 2 * len(words), *words)
+        request: ModbusPDU
+        if function == WRITE_COIL:
+            request = WriteSingleCoilRequest(dev_id=unit, address=address, bits=[bool(words[0])])
         else:
-            pdu += struct.pack(">H", COIL_ON * bool(words[0]) if function == WRITE_COIL else words[0])
-        answer = self._ask(pdu, unit, timeout_s)
+            kind = WriteMultipleRegistersRequest if function == WRITE_SEVERAL else WriteSingleRegisterRequest
+            request = kind(dev_id=unit, address=address, registers=words)
+        answer = self._ask(request, timeout_s)
         if answer[0] & REFUSAL:
             return answer[1] or 4
-        if answer != pdu[:5]:
+        if answer != _pdu(request)[:5]:
             raise NoAnswer(f"another value was confirmed ({answer.hex(' ')}): check 'register' and 'type'")
         return 0
 
-    def _ask(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+    def _ask(self, message: ModbusPDU, timeout_s: float) -> bytes:
         """Return the PDU of the answer. Raises NoAnswer, or HardwareError when the link is gone."""
         with self._lock:
             if self.broken:
                 raise HardwareError(f"{self.port}: the connection is gone")
             try:
-                answer = self._ask_again(pdu, unit, timeout_s)
+                answer = self._ask_again(message, timeout_s)
             except HardwareError:  # it could not be connected again
                 self.broken = True
                 raise
@@ -162,11 +186,11 @@ class Link:
             _SILENT.pop(self.port, None)
             return answer
 
-    def _ask_again(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+    def _ask_again(self, message: ModbusPDU, timeout_s: float) -> bytes:
         """Ask; again over a new connection where a server that has answered before closed this one."""
         for left in reversed(range(ATTEMPTS)):
             try:
-                return self._ask_once(pdu, unit, timeout_s)
+                return self._ask_once(message, timeout_s)
             except (_Closed, ConnectionError) as e:
                 if self._network is None:
                     raise OSError("it was unplugged") from None
@@ -176,11 +200,11 @@ class Link:
             self._open(timeout_s)
         raise AssertionError("the last attempt raises")
 
-    def _ask_once(self, pdu: bytes, unit: int, timeout_s: float) -> bytes:
+    def _ask_once(self, message: ModbusPDU, timeout_s: float) -> bytes:
         """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self._drop()
-        request = self._framed(pdu, unit)
+        request = self._framed(message)
         end = time.monotonic() + timeout_s
         self._send(request.frame, end)
         received = b""
@@ -200,13 +224,10 @@ class Link:
         characters = GAP_CHARACTERS * (2 + self.line.data_bits + self.line.stop_bits) / self.line.baud
         self._free_s = time.monotonic() + (max(GAP_MIN_S, characters) if self._is_rtu else 0.0)
 
-    def _framed(self, pdu: bytes, unit: int) -> _Request:
-        if self._is_rtu:
-            body = bytes((unit,)) + pdu
-            return _Request(unit, pdu, body + checksum("modbus", body).to_bytes(2, "little"))
-        self._transaction = self._transaction % 0xFFFF + 1
-        head = struct.pack(">HHHB", self._transaction, 0, len(pdu) + 1, unit)
-        return _Request(unit, pdu, head + pdu, self._transaction)
+    def _framed(self, message: ModbusPDU) -> _Request:
+        self._transaction = message.transaction_id = self._transaction % 0xFFFF + 1
+        frame = self._framer.buildFrame(message)
+        return _Request(message.dev_id, _pdu(message), frame, self._transaction)
 
     def _drop(self) -> None:
         """Drop the bytes that came before this request. Raises _Closed, OSError."""
@@ -268,6 +289,10 @@ class Link:
         if data[1] & ~REFUSAL != request.function:
             return f"{text} with function {data[1]}, {request.function} was asked for: check 'kind'"
         return f"{text} of a wrong length: check 'type' and 'max_block'"
+
+
+def _pdu(message: ModbusPDU) -> bytes:
+    return bytes((message.function_code,)) + message.encode()
 
 
 class _Serial:
