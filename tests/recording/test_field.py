@@ -41,6 +41,8 @@ CLOCKS = {
     "summer time by the zone": (table("time,T", "2026-03-29 01:59:59 CET,20", "2026-03-29 03:00:00 CEST,21"), [0, 1]),
     "a time of day over a counter": (table("No,Uhrzeit,T", "1,23:59:59,20", "2,00:00:00,21"), [0, 1]),
     "minutes and seconds": (table("time,T", "10:59.5,20", "11:00.0,21"), [0, 0.5]),
+    "minutes and seconds by the name": (table("Time (min:sec),T", "59:30,20", "60:00,21", "60:30,22"), [3570, 3600, 3630]),
+    "the same in brackets": (table("Elapsed [mm:ss],T", "0:00,20", "0:30,21", "1:00,22"), [0, 30, 60]),
     "newest first": (table("time,T", f"{ISO}1,21", f"{ISO}0,20"), [0, 1]),
     "a counter, for want of times": (table("#;T", "1;20", "2;21", "3;22"), [1, 2, 3]),
     "an interval above the header": (table("Sampling interval: 0.5 s", "T,P", "20,1", "20,2", "20,3"), [0, 0.5, 1]),
@@ -187,3 +189,10 @@ def test_names_of_parquet_state_units_as_those_of_a_text(tmp_path):
     pq.write_table(pa.table(columns), path)
     found = read_recording(path)
     assert found.t.tolist() == [0, 0.5, 1] and found.units == {"P": "mW"} and "P" in found.columns
+
+
+def test_a_counter_does_not_replace_times_that_cannot_be_read(tmp_path):
+    rows = [f"{i},0:00:00:0{i}.5,2{i}" for i in range(3)]
+    with pytest.raises(InputError, match=r":2: column 'Elapsed': '0:00:00:00.5' is no time .*'Scan'"):
+        read(tmp_path, table("Scan,Elapsed,T", *rows))
+    assert read(tmp_path, table("Scan,Elapsed,T", *rows), time="Scan").t.tolist() == [0, 1, 2]

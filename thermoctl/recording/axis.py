@@ -132,6 +132,9 @@ def _run(t: np.ndarray) -> tuple[int, str]:
     return STRICT + (EVEN if even else 0), "increases evenly" if even else "increases"
 
 
+_MINUTES = re.compile(r"(?i)(?<![:\w])m+(?:in\w*)?:s")  # a header such as "Time (min:sec)"
+
+
 def read(name: str, cells: Cells, unit: str | None) -> Seconds:
     """Return a column as seconds. Raises ClockError for one that cannot be a time."""
     if isinstance(cells, np.ndarray):
@@ -148,6 +151,8 @@ def read(name: str, cells: Cells, unit: str | None) -> Seconds:
         return clock.from_numbers(cells, unit_of_time(name, unit), named(name) > 0)
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
+    if _MINUTES.search(f"{name} {unit or ''}") and (found := clock.from_minutes(cells)) is not None:
+        return found
     return clock.from_texts(cells)
 
 

@@ -173,6 +173,15 @@ def from_stamps(stamps: np.ndarray) -> Seconds:
     return Seconds(t, start, f"dates from {start.replace('T', ' ')}", "date and time")
 
 
+def from_minutes(texts: pa.Array) -> Seconds | None:
+    """Return texts such as 75:30.5, minutes and seconds, as seconds; None where one is no such text."""
+    parts = pc.extract_regex(pc.utf8_trim_whitespace(texts), r"^(?P<m>\d+):(?P<s>\d{1,2}(?:\.\d+)?)$")
+    if parts.null_count:
+        return None
+    t = 60.0 * parts.field("m").cast(pa.float64()).to_numpy() + parts.field("s").cast(pa.float64()).to_numpy()
+    return Seconds(t, None, "minutes and seconds, as its name says", "duration")
+
+
 def from_texts(texts: pa.Array) -> Seconds:
     """Return dates, times of day or durations as seconds from the first. Raises ClockError.
 

@@ -465,6 +465,7 @@ def _valued(path: Path, sheet: Sheet, how: How) -> Sheet:
         elif values is not None:
             found.columns[name] = values
         else:
+            found.left[name] = next((w for w in column.to_pylist() if w and w.strip()), "")
             left.append(name.partition("\0")[0].strip() or f"column {list(sheet.columns).index(name) + 1}")
     if left:
         found.notes.append(f"columns of text left out: {', '.join(left)}")
@@ -526,6 +527,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
     found: list[Table] = []
     several = _clocks(path, sheet, how)
     for timer, names in several:
+        _refuse_lost(sheet, timer)
         t = np.full(len(sheet), np.nan)
         t[: len(timer.seconds.t)] = timer.seconds.t
         values: dict[str, np.ndarray] = {}
@@ -558,6 +560,16 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         )
         _trace(how, timer, found[-1])
     return found
+
+
+def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
+    """Refuse a counter as the clock beside times that cannot be read."""
+    for name, word in sheet.left.items() if counter.counter else ():
+        if axis.named(name) > 0 and any(c.isdigit() for c in word):
+            raise InputError(
+                f"{sheet.place(0)}: column '{name}': '{word}' is no time in a form that is known, and the only other "
+                f"clock is the counter {counter.where}; name that with --time, or write the times in seconds"
+            )
 
 
 def _moved(start: str, seconds: float) -> str:

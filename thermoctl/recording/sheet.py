@@ -25,6 +25,7 @@ class Sheet:
     - `start`: the date of time 0
     - `decimal`: the decimal sign that the file shows
     - `clock`: the times, where the format gives them
+    - `left`: the first words of each column of text that was left out
     - `again`: reads the rows once more, cell by cell, if they make no table"""
 
     columns: dict[str, Cells]
@@ -39,6 +40,7 @@ class Sheet:
     again: Callable[[], list[Sheet]] | None = None
     meta: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    left: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
