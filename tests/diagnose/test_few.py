@@ -1,9 +1,12 @@
 """Few samples are enough where the plant file states the noise; else the error says how many are needed."""
 
+import re
+
 import numpy as np
 import pytest
 
 import thermoctl as tc
+from thermoctl.cli import main
 from thermoctl.plant.files import loads
 from thermoctl.yamlfile import InputError
 
@@ -57,3 +60,13 @@ def test_of_unknown_noise_more_are_needed():
     ):
         with pytest.raises(InputError, match="too little data: .* 40 are needed, or 12 where"):
             tc.diagnose(plant, data)
+
+
+def test_a_warning_of_the_plant_is_printed_once(tmp_path, capsys):
+    (tmp_path / "plant.yaml").write_text(re.sub(r"unit: [^,}]+(, )?", "", PLANT))
+    data = run(20)
+    rows = np.column_stack(list(data.values()))
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header=",".join(data), comments="")
+    out, plant = str(tmp_path / "out"), str(tmp_path / "plant.yaml")
+    assert main(["diagnose", "--plant", plant, str(tmp_path / "run.csv"), "--out", out]) == 0
+    assert capsys.readouterr().err.count("no quantity has a unit") == 1

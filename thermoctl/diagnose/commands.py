@@ -105,7 +105,7 @@ def diagnose(args: argparse.Namespace) -> int:
     plant = load(args.plant, args.map)
     given, found_before = checked(plant, args.recordings, args)
     held_out, found_held = checked(plant, args.held_out or (), args)
-    report([*found_before, *found_held], sys.stderr)
+    report(list(dict.fromkeys([*found_before, *found_held])), sys.stderr)
     if any(f.severe for f in (*found_before, *found_held)) and not args.anyway:
         raise InputError(
             f"{args.plant}: not diagnosed: the checks above would make any name doubtful; correct the data or the "
