@@ -25,30 +25,16 @@ import struct
 import threading
 import time
 from dataclasses import dataclass
+from typing import Any
 
-from pymodbus import ModbusException
-from pymodbus.framer import FramerRTU, FramerSocket
-from pymodbus.pdu import DecodePDU, ModbusPDU
-from pymodbus.pdu.bit_message import ReadCoilsRequest, ReadDiscreteInputsRequest, WriteSingleCoilRequest
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadInputRegistersRequest,
-    WriteMultipleRegistersRequest,
-    WriteSingleRegisterRequest,
-)
-
+from thermoctl.extras import load
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
 from thermoctl_hal.serial.line import NETWORK, open_port
 
-READERS: dict[str, type[ModbusPDU]] = {
-    "coil": ReadCoilsRequest,
-    "discrete": ReadDiscreteInputsRequest,
-    "holding": ReadHoldingRegistersRequest,
-    "input": ReadInputRegistersRequest,
-}
-"""The request that reads a kind."""
+FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+"""Modbus function code that reads a kind."""
 BITS = ("coil", "discrete")
 WRITE_COIL, WRITE_SEVERAL = 5, 16
 REFUSAL = 0x80  # bit of the function code of an exception
@@ -97,8 +83,10 @@ class Link:
         self._answered = False
         self._free_s = 0.0  # an RTU frame may begin from then on
         self._is_rtu = port.startswith("rtu:")
-        self._decoder = DecodePDU(False)
-        self._framer = (FramerRTU if self._is_rtu else FramerSocket)(self._decoder)
+        messages, framers = (load(f"pymodbus.{name}", port) for name in ("pdu", "framer"))
+        self._invalid = load("pymodbus", port).ModbusException
+        self._requests, self._answers = messages.DecodePDU(True), messages.DecodePDU(False)
+        self._framer = (framers.FramerRTU if self._is_rtu else framers.FramerSocket)(self._answers)
         self._network = _PORT.fullmatch(port)
         if self._network is None and (not self._is_rtu or port.startswith(f"rtu:{NETWORK}")):
             raise HardwareError(
@@ -136,7 +124,8 @@ class Link:
 
         Raises NoAnswer, or HardwareError when the link is gone."""
         size = -(-count // 8) if kind in BITS else 2 * count
-        answer = self._ask(READERS[kind](dev_id=unit, address=address, count=count), timeout_s)
+        request = self._request(FUNCTIONS[kind], dev_id=unit, address=address, count=count)
+        answer = self._ask(request, timeout_s)
         if answer[0] & REFUSAL:
             return answer[1]
         if answer[1] != size or len(answer) != 2 + size:
@@ -145,22 +134,17 @@ class Link:
                 "'max_block'"
             )
         try:
-            found = self._decoder.decode(answer)
-        except (ModbusException, struct.error, IndexError) as e:
+            found = self._answers.decode(answer)
+        except (self._invalid, struct.error, IndexError) as e:
             raise NoAnswer(f"no valid answer: {answer[:SHOWN].hex(' ')} ({e})") from None
-        assert found is not None
         return [int(b) for b in found.bits[:count]] if kind in BITS else list(found.registers)
 
     def write(self, function: int, address: int, words: list[int], unit: int, timeout_s: float) -> int:
         """Write a coil (5), a register (6) or registers (16); return 0, or the exception code.
 
         Raises NoAnswer, or HardwareError when the link is gone."""
-        request: ModbusPDU
-        if function == WRITE_COIL:
-            request = WriteSingleCoilRequest(dev_id=unit, address=address, bits=[bool(words[0])])
-        else:
-            kind = WriteMultipleRegistersRequest if function == WRITE_SEVERAL else WriteSingleRegisterRequest
-            request = kind(dev_id=unit, address=address, registers=words)
+        value = {"bits": [bool(words[0])]} if function == WRITE_COIL else {"registers": words}
+        request = self._request(function, dev_id=unit, address=address, **value)
         answer = self._ask(request, timeout_s)
         if answer[0] & REFUSAL:
             return answer[1] or 4
@@ -168,7 +152,11 @@ class Link:
             raise NoAnswer(f"another value was confirmed ({answer.hex(' ')}): check 'register' and 'type'")
         return 0
 
-    def _ask(self, message: ModbusPDU, timeout_s: float) -> bytes:
+    def _request(self, function: int, **content: Any) -> Any:
+        """Return pymodbus' request of a function code."""
+        return self._requests.lookupPduClass(bytes((0, function)))(**content)
+
+    def _ask(self, message: Any, timeout_s: float) -> bytes:
         """Return the PDU of the answer. Raises NoAnswer, or HardwareError when the link is gone."""
         with self._lock:
             if self.broken:
@@ -186,7 +174,7 @@ class Link:
             _SILENT.pop(self.port, None)
             return answer
 
-    def _ask_again(self, message: ModbusPDU, timeout_s: float) -> bytes:
+    def _ask_again(self, message: Any, timeout_s: float) -> bytes:
         """Ask; again over a new connection where a server that has answered before closed this one."""
         for left in reversed(range(ATTEMPTS)):
             try:
@@ -200,7 +188,7 @@ class Link:
             self._open(timeout_s)
         raise AssertionError("the last attempt raises")
 
-    def _ask_once(self, message: ModbusPDU, timeout_s: float) -> bytes:
+    def _ask_once(self, message: Any, timeout_s: float) -> bytes:
         """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self._drop()
@@ -224,7 +212,7 @@ class Link:
         characters = GAP_CHARACTERS * (2 + self.line.data_bits + self.line.stop_bits) / self.line.baud
         self._free_s = time.monotonic() + (max(GAP_MIN_S, characters) if self._is_rtu else 0.0)
 
-    def _framed(self, message: ModbusPDU) -> _Request:
+    def _framed(self, message: Any) -> _Request:
         self._transaction = message.transaction_id = self._transaction % 0xFFFF + 1
         frame = self._framer.buildFrame(message)
         return _Request(message.dev_id, _pdu(message), frame, self._transaction)
@@ -291,7 +279,7 @@ class Link:
         return f"{text} of a wrong length: check 'type' and 'max_block'"
 
 
-def _pdu(message: ModbusPDU) -> bytes:
+def _pdu(message: Any) -> bytes:
     return bytes((message.function_code,)) + message.encode()
 
 
