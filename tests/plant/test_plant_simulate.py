@@ -211,22 +211,3 @@ def test_a_factorisation_by_table_gives_the_same_bytes_as_one_written_out(monkey
         monkeypatch.setattr("thermoctl.plant.compile._LOADED", {})
         runs.append(compile_plant(plant).simulate(Table("run", "run", t, columns), sensitivities=True))
     assert np.array_equal(runs[0].y, runs[1].y) and np.array_equal(runs[0].dy, runs[1].dy)
-
-
-@pytest.mark.parametrize("push", [1.3, 2.0, 5.0])
-def test_a_jump_inside_a_step_is_followed(push):
-    """A mass under dry friction reverses between samples, against a far smaller tolerance."""
-    plant = loads(
-        HEAD
-        + """
-inputs: {P: {unit: N, between_samples: linear}}
-parameters: {m: {value: 2}, F: {value: 1}}
-nodes: {v: {storage: m, initial: 0.1}, x: {storage: 1, initial: 0}}
-flows: {push: {into: v, rate: P}, dry: {from: v, rate: F * sign(v)}, go: {into: x, rate: v}}
-outputs: {speed: {value: v}, y: {value: x}}"""
-    )
-    model, t = compile_plant(plant), np.arange(0.0, 30.0, 0.1)
-    d = model.excitation(Table("jump", "jump", t, {"P": push * np.cos(0.7 * t)}))
-    found, exact = model.run(d).y, model.run(dataclasses.replace(d, rtol=1e-11)).y
-    assert np.ptp(np.sign(exact[:, 0])) == 2
-    np.testing.assert_allclose(found / np.ptp(exact, axis=0), exact / np.ptp(exact, axis=0), atol=5e-5)

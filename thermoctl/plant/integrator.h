@@ -1,9 +1,7 @@
 /* The integrator behind every compiled plant. The generated file defines the sizes, the pattern of the Jacobian and the
    functions rhs_, jac_, sens_, factor_, solve_, solve_lanes_ and includes this file.
 
-   Inputs change at each sample, so that most steps are far shorter than accuracy needs: there the classical Runge-Kutta
-   method of order 4 is tried first, and esdirk.h where its error does not pass. Sensitivities S = dx/dq are the exact
-   derivative of the step that was taken; of ESDIRK's the converged one's:
+   States by esdirk.h. Sensitivities S = dx/dq are the exact derivative of the converged step:
        (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
 #include "esdirk.h"
 
@@ -116,60 +114,6 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
   return 1;
 }
 
-#define POINTS 4                                                          /* stages of the explicit step */
-static const double RC_[POINTS] = {0, 0.5, 0.5, 1}, RB_[POINTS] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
-#define STIFF 0.2             /* of a sampling interval: where explicit steps are shorter, ESDIRK takes the next ones */
-#define WAIT 16                              /* steps of ESDIRK after a failure, doubled each time up to WAIT_MOST */
-#define WAIT_MOST 4096
-
-/* One explicit step. k: slopes at the stages and at the end, the first one given where `have`; xs: the stages' states.
-   Returns the norm of the error, beside the method of order 3 that takes the slope at the end for that of the last stage. */
-static double try_explicit(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
-                           const double *p, const double *w, const double *x, double rtol, const double *atol,
-                           double *k, double *xs, double *xn, int have) {
-  double u[NU + 1], e[NX + 1];
-  const double *const end = k + POINTS * NX;
-  for (int s = 0; s <= POINTS; s++) {
-    const double ts = t + (s < POINTS ? RC_[s] : 1) * h;
-    double *const X = s < POINTS ? xs + s * NX : xn;
-    memcpy(X, x, NX * sizeof(double));
-    if (s == POINTS) for (int q = 0; q < POINTS; q++) for (int i = 0; i < NX; i++) X[i] += h * RB_[q] * k[q * NX + i];
-    else if (s) for (int i = 0; i < NX; i++) X[i] += h * RC_[s] * k[(s - 1) * NX + i];
-    if (!s && have) continue;
-    inputs_at((ts - ta) / dt, u0, u1, lin, u);
-    rhs_(ts, X, u, p, w, k + s * NX);
-  }
-  for (int i = 0; i < NX; i++) e[i] = h / 6 * (end[i] - k[3 * NX + i]);
-  return norm_(e, x, xn, rtol, atol);
-}
-
-/* The sensitivities over the step that try_explicit accepted; c->S is advanced in place. */
-static void sens_explicit(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
-                          const double *p, const double *w, const double *xs, Columns *c, const Forces *force, int n) {
-  double u[NU + 1], J[POINTS][NJ + 1];
-  for (int s = 0; s < POINTS; s++) {
-    double ts = t + RC_[s] * h, *V = c->V + (size_t)s * c->count;
-    inputs_at((ts - ta) / dt, u0, u1, lin, u);
-    if (force) {
-      const double *q0 = force->q + (size_t)n * c->count, *q1 = q0 + c->count, part = (ts - ta) / dt;
-      for (int e = 0; e < c->count; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
-    } else sens_(ts, xs + s * NX, u, p, w, V);
-    if (!LINEAR || !s) jac_(ts, xs + s * NX, u, p, w, J[s]);
-  }
-  for (int g = 0; g < c->groups; g++) {
-    lanes K[POINTS][NX + 1], R[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
-    for (int s = 0; s < POINTS; s++) {
-      const double *V = c->V + (size_t)s * c->count, *j = J[LINEAR ? 0 : s], a = h * RC_[s];
-      lanes *const k = K[s];
-      memset(k, 0, (NX + 1) * sizeof(lanes));
-      for (int i = 0; i < NX; i++) R[i] = s ? S[i] + a * K[s - 1][i] : S[i];
-      for (int e = c->begin[g]; e < c->begin[g + 1]; e++) ((double *)k)[c->slot[e]] += V[c->entry[e]];
-      for (int q = 0; q < NJ; q++) k[J_ROW[q]] += j[q] * R[J_COL[q]];
-    }
-    for (int s = 0; s < POINTS; s++) for (int i = 0; i < NX; i++) S[i] += h * RB_[s] * K[s][i];
-  }
-}
-
 /* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
    and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. `own`: the columns of SX
    are sensitivities, so that the outputs' own slopes by the parameters count. */
@@ -204,7 +148,6 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
   double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1], Ms[(LINEAR ? 1 : STAGES) * (NM + 1)];
   size_t block = (size_t)NX * nc;
   double want = 0, hfac = 0, hfac_s = 0;
-  int have = 0, skip = 0, wait = WAIT;                /* is k the slope here? steps that ESDIRK takes before the next try */
   Columns c = {0};
   if (SX) {
     if (!columns_(&c, nc, S0, force)) return -1;
@@ -220,7 +163,6 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
     const double *u0 = U + (size_t)n * NU, *u1 = u0 + NU;
     double ta = t[n], dt = t[n + 1] - ta, at = ta;
     int steps = 0, failed = 0;
-    if (n && memcmp(u0, u0 - NU, NU * sizeof(double))) have = 0;
     while (at < t[n + 1]) {
       double left = t[n + 1] - at, h = want <= 0 || want >= left * 0.999 ? left : want;
       if (h < left && 2 * h > left) h = left / 2;
@@ -228,24 +170,6 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       if (last) h = left;
       if (last && at == ta && fabs(h - hfac) < 1e-9 * h) h = hfac;  /* a clock equal but for rounding: same factors */
       if (++steps > max_steps) { failed_at = n + 1; goto out; }
-      if (skip) skip--;
-      else {
-        double err = try_explicit(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, have);
-        int passed = err <= 1, stiff = passed && !last && h < STIFF * dt;
-        if (!passed || stiff) { skip = wait; wait = wait < WAIT_MOST ? 2 * wait : wait; }
-        have = passed;
-        if (passed) {
-          if (SX) sens_explicit(at, h, ta, dt, u0, u1, lin, p, w, xs, &c, force, n);
-          memcpy(x, xn, NX * sizeof(double));
-          memcpy(k, k + POINTS * NX, NX * sizeof(double));
-          info[0]++;
-          double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-3), -0.25));
-          if (!last || grow < want || want <= 0) want = grow; else want = fmax(want, grow);
-          at = last ? t[n + 1] : at + h;
-          continue;
-        }
-      }
-      have = 0;
       double err = try_step(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
       if (!(err >= 0 && err <= 1)) {
         info[1]++;
