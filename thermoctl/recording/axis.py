@@ -151,9 +151,8 @@ def read(name: str, cells: Cells, unit: str | None) -> Seconds:
         return clock.from_numbers(cells, unit_of_time(name, unit), named(name) > 0)
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
-    if _MINUTES.search(f"{name} {unit or ''}") and (found := clock.from_minutes(cells)) is not None:
-        return found
-    return clock.from_texts(cells)
+    minutes = clock.from_minutes(cells) if _MINUTES.search(f"{name} {unit or ''}") else None
+    return minutes or clock.from_texts(cells)
 
 
 def _exact(cells: pa.Array) -> Seconds:
