@@ -241,7 +241,7 @@ def _errors(found: Mapping[str, Any]) -> Table:
         "held_out_refit_only": "held out: refitted",
         "held_out_after": "held out: with the findings",
     }
-    if not found["findings"]:
+    if not found["findings"] and not (found["remainder"] or {}).get("law"):
         columns = {k: title for k, title in columns.items() if not k.endswith("after")}
     table = _table("rms of", "noise", *columns.values())
     for o, x in found["outputs"].items():

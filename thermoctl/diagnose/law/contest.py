@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import softmax
 
 from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.fit import Fitted
 from thermoctl.diagnose.law.find import refits
 from thermoctl.diagnose.law.forms import LAW
 from thermoctl.diagnose.law.propose import Proposal, propose_laws
@@ -82,13 +83,16 @@ def _laws(
 
 
 def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Limits) -> Weighed:
-    """Return the likeliest of the laws at one place; it holds the others that fit about as well."""
+    """Return the likeliest of the laws at one place; with others that fit about as well."""
     share = softmax(np.array([w.score for _, w in found]) / limits.temperature)
     order = np.argsort(-share, kind="stable")
     best = found[order[0]][1]
-    rivals = tuple(
-        (found[k][0], found[k][1].fitted, float(share[k])) for k in order[1:] if share[k] > 1 - limits.set
-    )
+    kinds = {found[order[0]][0].kind}
+    rivals: list[tuple[Proposal, Fitted, float]] = []
+    for k in order[1:]:
+        if share[k] > 1 - limits.set and found[k][0].kind not in kinds:
+            kinds.add(found[k][0].kind)
+            rivals.append((found[k][0], found[k][1].fitted, float(share[k])))
     *effects, law = best.fitted.hypothesis.effects
-    hypothesis = Hypothesis((*effects, replace(law, rivals=rivals)))
+    hypothesis = Hypothesis((*effects, replace(law, rivals=tuple(rivals))))
     return replace(best, fitted=replace(best.fitted, hypothesis=hypothesis))

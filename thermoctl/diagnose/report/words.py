@@ -101,7 +101,9 @@ def _found(found: Result) -> str:
         return text + (f"; also possible: {', '.join(others)}." if others else ".")
     if names:
         return f"Found: {listed(names)}."
-    return "Something is missing that no effect of the catalogue explains."
+    law = (found["remainder"] or {}).get("law")
+    follows = f": it follows {listed(law['of'])} at {law['where']}" if law and law["of"] else ""
+    return f"Something is missing that no effect of the catalogue explains{follows}."
 
 
 def law_sentence(entry: Result | None) -> str:
