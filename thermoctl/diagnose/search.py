@@ -33,6 +33,7 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.yamlfile import InputError
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
+FAILED = "its refit could not be simulated"
 SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
 BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
 # Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
@@ -351,7 +352,8 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
             if np.isfinite(gain):
                 best_gain = max((f.log_evidence for f in fits), default=-np.inf) - parent.fitted.log_evidence
                 ratio = max(ratio, best_gain / max(gain, 1.0))
-            s.refused[parent.fitted.hypothesis.keys | {d.candidate.key for d in added}] = INSIGNIFICANT
+            keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
+            s.refused[keys] = INSIGNIFICANT if fits else FAILED
             if found:
                 best = max(found, key=lambda f: f.log_evidence)
                 w = Weighed(best, odds(best.hypothesis.effects, where, limits))
