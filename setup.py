@@ -1,5 +1,6 @@
 """Builds the compiled parts: every .pyx, and every .py with its C types in a .pxd. The rest is in pyproject.toml."""
 
+import re
 from itertools import groupby
 from pathlib import Path
 
@@ -28,9 +29,14 @@ shipped = [
     (f"share/thermoctl/{folder}", list(map(str, of))) for folder, of in groupby(files, lambda p: p.parent)
 ]
 
+# An index has no files beside README: its links and pictures become their words.
+README = Path("README.md").read_text(encoding="utf-8")
+
 # -g0: no debug symbols, which were 15 of the compiled parts' 19 MB.
 # -ffp-contract=off: the law gives the same bits on every machine that a recording is replayed on.
 setup(
+    long_description=re.sub(r"!?\[([^\]]*)\]\((?!https?:)[^)]*\)", r"\1", README),
+    long_description_content_type="text/markdown",
     data_files=shipped,
     ext_modules=cythonize(
         [

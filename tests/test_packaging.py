@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-OURS = ("test", "all", "fuzz", "bench")  # for developers, or made of the others
+OURS = ("test", "all", "docs", "fuzz", "bench")  # for developers, or made of the others
 NEEDS = {
     re.match(r"[\w.-]+", need)[0]: extra
     for extra, needs in {"": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}.items()

@@ -2,7 +2,7 @@
 
 `python -m thermoctl.reference [--check]`.
 
-They are configuration, device-profiles, signals, faults, effects, cli, commands-that-act and python in
+They are configuration, device-profiles, signals, faults, effects, cli and commands-that-act in
 docs/reference, and one page a fault in docs/faults.
 With --check nothing is written; exit status 1 if a page is stale, and its name on stderr.
 """
@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
-import inspect
 import math
 import sys
 from collections.abc import Iterable
@@ -20,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from thermoctl import api
 from thermoctl.cli import parser
 from thermoctl.configuration.settings import SECTIONS, options
 from thermoctl.configuration.which_rig import ACTS
@@ -264,61 +261,11 @@ def cli() -> str:
     return _HEAD + "# Commands\n\n" + "\n".join(pages)
 
 
-_PYTHON = """# Python
-
-```python
-import thermoctl as tc
-
-plant = tc.load_plant("docs/examples/heater/plant.yaml")
-result = tc.diagnose(plant, ["docs/examples/heater/run_1.csv", "docs/examples/heater/run_2.csv"])
-result.verdict  # 'explained'
-result.findings[0].equation
-result.plot()  # measured, as it came, refitted, with the findings
-result.plant.save("extended.yaml")
-result.plant.export("extended.fmu", "docs/examples/heater/run_1.csv")
-fitted = tc.refit(result.plant, "docs/examples/heater/run_1.csv")
-fitted.plot("temperature_2")  # residuals, autocorrelation, cumulated periodogram, normal quantiles
-fitted.plot_profile("G_12")  # profile likelihood
-```
-
-Results show themselves in a notebook ([notebooks](../notebooks)). Figures are matplotlib's. The package is typed.
-"""
-
-
-def python() -> str:
-    """Return the page of the Python interface, from its docstrings."""
-    text = f"{_HEAD}{_PYTHON}\n{inspect.getdoc(api)}\n"
-    for label in api.__all__:
-        item = getattr(api, label)
-        if inspect.isclass(item):
-            text += f"\n## {label}\n{inspect.getdoc(item)}\n\n"
-            rows = [(k, v) for k, v in vars(item).items() if not k.startswith("_") and _documented(v)]
-            text += _table(("member", "meaning"), ((f"`{k}{_signature(v)}`", _line(v)) for k, v in rows))
-        else:
-            text += f"\n## {label}\n```python\n{label}{_signature(item)}\n```\n{inspect.getdoc(item)}\n"
-    return text
-
-
-def _documented(item: object) -> bool:
-    return inspect.isfunction(item) or isinstance(item, property | functools.cached_property)
-
-
-def _signature(item: object) -> str:
-    """Return a function's arguments as written; nothing for a property."""
-    if not inspect.isfunction(item):
-        return ""
-    return str(inspect.signature(item)).replace("'", "").replace("(self, ", "(").replace("(self)", "()")
-
-
-def _line(item: object) -> str:
-    return " ".join((inspect.getdoc(item) or "").split())
-
-
 def pages() -> dict[Path, str]:
     """Return every generated page by its path below docs/."""
     made = {
         Path("reference", f"{make.__name__.replace('_', '-')}.md"): make()
-        for make in (configuration, device_profiles, signals, faults, effects, cli, commands_that_act, python)
+        for make in (configuration, device_profiles, signals, faults, effects, cli, commands_that_act)
     }
     return made | {Path("faults", f"{f.name}.md"): fault(f) for f in FAULTS}
 

@@ -1,6 +1,7 @@
-"""The wheel in a fresh environment, from an empty folder: what works, its size and that of each extra, its imports.
+"""The wheel in a fresh environment, from an empty folder: what works; with --sizes also megabytes, imports and every extra.
 
-`make size`, which runs `python tests/bench/install.py WHEEL`. One step takes the C compiler away, and shows what asks for one.
+`make try-wheel` and `make size`, which run `python tests/bench/install.py WHEEL [--sizes]`. One step of --sizes takes the C compiler
+away, and shows what asks for one.
 """
 
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 DIAGNOSE = "diagnose --plant examples/heater/plant.yaml examples/heater/run_1.csv examples/heater/run_2.csv --out result --quiet"
 STEPS = (
+    "--version",
     "init",
     "check config/simulated.yaml",
     "demo --seconds 5",
@@ -45,25 +47,14 @@ def step(program: Path, command: str, folder: Path, own: dict[str, str]) -> int:
 def main() -> int:
     """Print the tables; return 1 where a step fails."""
     with tempfile.TemporaryDirectory(prefix="thermoctl-wheel") as made:
-        work, wheel = Path(made), sys.argv[1]
+        work, wheel, sizes = Path(made), Path(sys.argv[1]).resolve(), "--sizes" in sys.argv
         subprocess.run([sys.executable, "-m", "venv", work / "venv"], check=True)
         python, program = work / "venv/bin/python", work / "venv/bin/thermoctl"
         site = next((work / "venv/lib").glob("python*/site-packages"))
         empty = size(site)
         subprocess.run([python, *PIP, "install", wheel], check=True)
-        sizes = sorted(((size(p), p.name) for p in site.iterdir() if p.is_dir()), reverse=True)
-        print(
-            f"{size(site) - empty:.0f} MB: "
-            + ", ".join(f"{n} {s:.0f}" for s, n in sizes if n != "pip" and s > 4),
-            flush=True,
-        )
-        for module in IMPORTS:
-            took = []
-            for _ in range(4):  # the first also reads the disk
-                begin = time.monotonic()
-                subprocess.run([python, "-c", f"import {module}"], check=True, cwd=work)
-                took.append(time.monotonic() - begin)
-            print(f"import {module}: {min(took):.2f} s, the first time {took[0]:.2f} s", flush=True)
+        if sizes:
+            base(python, site, empty)
         folder = work / "empty"
         folder.mkdir()
         own = {
@@ -73,21 +64,32 @@ def main() -> int:
             "XDG_STATE_HOME": str(work / "state"),
         }
         failed = sum(step(program, s, folder, own) != 0 for s in STEPS)
-        print("without a C compiler, and without plants that were compiled before:")
-        step(
-            program,
-            DIAGNOSE,
-            folder,
-            own | {"PATH": str(python.parent), "XDG_CACHE_HOME": str(work / "none")},
-        )
-        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-        for extra in re.split(r"[\[,\]]", project["optional-dependencies"]["all"][0])[1:-1]:
-            before = size(site)
-            subprocess.run([python, *PIP, "install", f"{wheel}[{extra}]"], check=True)
-            print(f"extra {extra}: {size(site) - before:.0f} MB more", flush=True)
-        print(f"with all extras: {size(site) - empty:.0f} MB", flush=True)
-        failed += sum(step(program, s, folder, own) != 0 for s in WITH_ALL)
+        if sizes:
+            print("without a C compiler, and without plants that were compiled before:")
+            bare = {"PATH": str(python.parent), "XDG_CACHE_HOME": str(work / "none")}
+            step(program, DIAGNOSE, folder, own | bare)
+            project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+            for extra in re.split(r"[\[,\]]", project["optional-dependencies"]["all"][0])[1:-1]:
+                before = size(site)
+                subprocess.run([python, *PIP, "install", f"{wheel}[{extra}]"], check=True)
+                print(f"extra {extra}: {size(site) - before:.0f} MB more", flush=True)
+            print(f"with all extras: {size(site) - empty:.0f} MB", flush=True)
+            failed += sum(step(program, s, folder, own) != 0 for s in WITH_ALL)
     return int(failed > 0)
+
+
+def base(python: Path, site: Path, empty: float) -> None:
+    """Print the megabytes of the base installation, and the seconds of each import."""
+    sizes = sorted(((size(p), p.name) for p in site.iterdir() if p.is_dir()), reverse=True)
+    large = ", ".join(f"{n} {s:.0f}" for s, n in sizes if n != "pip" and s > 4)
+    print(f"{size(site) - empty:.0f} MB: {large}", flush=True)
+    for module in IMPORTS:
+        took = []
+        for _ in range(4):  # the first also reads the disk
+            begin = time.monotonic()
+            subprocess.run([python, "-c", f"import {module}"], check=True, cwd=site.parents[2])
+            took.append(time.monotonic() - begin)
+        print(f"import {module}: {min(took):.2f} s, the first time {took[0]:.2f} s", flush=True)
 
 
 if __name__ == "__main__":

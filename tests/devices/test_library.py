@@ -121,7 +121,7 @@ def test_a_device_is_read_as_its_manual_says(tmp_path, name, capsys):
                 value = ", ".join(f"{c} {v:g}" for c, v in list(device.expected.items())[:2])
                 more = f" and {len(device.expected) - 2} more" if len(device.expected) > 2 else ""
                 times = f"{first_s:.2f}", f"{again_s:.2f}"
-                problem = found[device.bad].problem.replace("|", "/")
+                problem = f"`{found[device.bad].problem.replace('|', '/')}`"
                 print(_table_row(name, profile, value + more, *times, problem))
     finally:
         device.wire.close()
