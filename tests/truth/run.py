@@ -1,18 +1,21 @@
-"""Diagnose one case without report and experiment, and keep what the table needs."""
+"""Diagnose one case without report and experiment, and keep what the table needs; keep its search, too."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import pickle
 import resource
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from thermoctl import __version__
 from thermoctl.diagnose import diagnosis as engine
+from thermoctl.diagnose.case import Budget
 from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.threads import one_thread
 from thermoctl.fleet.jobs import Job, Run
@@ -20,6 +23,8 @@ from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.yamlfile import InputError
+
+KEPT = "sought.pickle"
 
 
 def diagnose(job: Job, out: str) -> Run:
@@ -29,7 +34,7 @@ def diagnose(job: Job, out: str) -> Run:
     started, cpu = time.monotonic(), _cpu()
     try:
         with one_thread():
-            result = _result(job)
+            result = _result(job, folder / KEPT)
     except (InputError, SimulationError) as e:
         error = str(e)
     except Exception as e:  # a crash is a result
@@ -48,10 +53,34 @@ def diagnose(job: Job, out: str) -> Run:
     return run
 
 
-def _result(job: Job) -> dict[str, Any]:
+def _result(job: Job, path: Path) -> dict[str, Any]:
+    found = sought(job, limits())
+    result = contract(engine.decided(found))
+    _keep(found, path)
+    return result
+
+
+def sought(job: Job, numbers: Limits) -> engine.Sought:
+    """Return the search of a job. Raises InputError, SimulationError."""
     plant = load(job.plant)
     tables, apart = (read_recordings(plant, files) for files in (job.recordings, job.held_out))
-    return contract(engine.diagnose(plant, tables, catalogue((CATALOGUE,)), limits(), apart))
+    return engine.sought(plant, tables, catalogue((CATALOGUE,)), numbers, apart)
+
+
+def _keep(sought: engine.Sought, path: Path) -> None:
+    """Keep a search without its budget, which holds functions, and without the sums of its screening."""
+    budget = sought.case.budget
+    case = dataclasses.replace(sought.case, budget=cast(Budget, None))
+    searched = dataclasses.replace(sought.searched, norms=())
+    lean = dataclasses.replace(sought, case=case, searched=searched)
+    path.write_bytes(pickle.dumps((lean, budget.fits, budget.fits_done, budget.untried), -1))
+
+
+def kept(out: Path) -> engine.Sought:
+    """Return the search of a diagnosis that OUT keeps."""
+    sought, fits, done, untried = pickle.loads((out / KEPT).read_bytes())
+    budget = Budget(fits, fits_done=done, untried=untried)
+    return dataclasses.replace(sought, case=dataclasses.replace(sought.case, budget=budget))
 
 
 def _cpu() -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from thermoctl.diagnose.case import Budget, Case, case
 from thermoctl.diagnose.catalogue import Effect, contained
@@ -28,6 +28,20 @@ from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
 
+@dataclass(frozen=True)
+class Sought:
+    """All hypotheses that were tried, before a decision.
+
+    `reserve`: recordings that take no part in any choice. `unsure`: an untried hypothesis may be likelier, so
+    that nothing is named."""
+
+    case: Case
+    searched: Searched
+    limits: Limits
+    reserve: tuple[Table, ...]
+    unsure: bool
+
+
 @one_thread()
 def diagnose(
     plant: Plant,
@@ -45,23 +59,39 @@ def diagnose(
     Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
     of earlier recordings."""
     say = progress or (lambda text: None)
+    found = sought(plant, tables, entries, numbers, held_out, say, stopped, memory)
+    say("measuring what the findings are worth")
+    return decided(found)
+
+
+def sought(
+    plant: Plant,
+    tables: Sequence[Table],
+    entries: Mapping[str, Effect],
+    numbers: Limits,
+    held_out: Sequence[Table] = (),
+    say: Callable[[str], None] = lambda text: None,
+    stopped: Callable[[], bool] = lambda: False,
+    memory: Memory = NOTHING,
+) -> Sought:
+    """Try the hypotheses; arguments as of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
     searched = with_laws(known, search(known, numbers), numbers, say)
-    say("measuring what the findings are worth")
-    found = _decided(known, searched, numbers, reserve, stopped() and bool(known.budget.untried))
+    return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
+
+
+def decided(sought: Sought) -> Diagnosis:
+    """Return what a search says: posterior, findings and their worth, remainder, verdict, missing flow."""
+    found = _decided(sought)
     if found.decision.verdict != "consistent" and not found.shown and found.before.node:
-        found = replace(found, missing_flow=missing_flow(known, found.null, found.before.node))
+        found = replace(found, missing_flow=missing_flow(sought.case, found.null, found.before.node))
     return found
 
 
-def _decided(
-    known: Case, searched: Searched, numbers: Limits, reserve: Sequence[Table], unsure: bool
-) -> Diagnosis:
-    """Return what a search says: posterior, findings and their worth, remainder, verdict.
-
-    `unsure`: an untried hypothesis may be likelier, so that nothing is named."""
+def _decided(sought: Sought) -> Diagnosis:
+    known, searched, numbers, reserve = sought.case, sought.searched, sought.limits, sought.reserve
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
@@ -79,7 +109,7 @@ def _decided(
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, reserve)
-    keys = () if unsure else (e.key for e in best.hypothesis.effects)
+    keys = () if sought.unsure else (e.key for e in best.hypothesis.effects)
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
     # data that took part in the choice cannot speak against it
     told = bool(best.hypothesis.effects) and value.reserved

@@ -1,0 +1,222 @@
+"""What each rule on the way to a name is worth: the cases of `make truth`, decided without it.
+
+    python -m tests.truth.ablate [--number 60] [--only home,foreign,closed,open] [--search] [RULE...]
+
+RULES is the list of all rules that decide. A rule of the decision is left out of the searches that
+`make truth` kept, in a minute; one of the search (--search) needs new searches. Prints, for each rule and
+group, right names, strays and the log score with it and without it, and the cases that change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tests.truth.__main__ import GROUPS, cases
+from tests.truth.cases import Case
+from tests.truth.judge import Row, changes, figures, row
+from tests.truth.run import KEPT, kept, sought
+from thermoctl.diagnose import diagnosis as engine
+from thermoctl.diagnose.limits import limits
+from thermoctl.diagnose.result import contract
+from thermoctl.diagnose.threads import one_thread
+from thermoctl.diagnose.unknown_flow import Missing
+from thermoctl.fleet.jobs import Job, outcome
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule, where it stands, and how to leave it out.
+
+    - `without`: name of the program (below thermoctl.diagnose) to what takes its place
+    - `limits`: numbers of config/diagnosis.yaml in place of theirs
+    - `searches`: it acts in the search, else in the decision"""
+
+    says: str
+    without: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+    searches: bool = False
+
+
+def _keeps(posterior: Any, found: Any, *rest: Any) -> Any:
+    return found, posterior, {}
+
+
+def _ours(case: Any, f: Any) -> Any:
+    return f
+
+
+def _first(likeliest: Any, physics: Any) -> Any:
+    return likeliest
+
+
+def _nothing(*a: Any) -> Any:
+    return ()
+
+
+def _no(*a: Any) -> bool:
+    return False
+
+
+def _sure(*a: Any) -> float:
+    return 1.0
+
+
+def _precise(case: Any, f: Any) -> list[float]:
+    return [0.0] * len(case.grids)
+
+
+def _fine(case: Any) -> list[bool]:
+    return [False] * len(case.grids)
+
+
+RULES: Mapping[str, Rule] = {
+    "temperature": Rule("differences in log evidence are divided by 1.5", limits={"temperature": 1.0}),
+    "misfit": Rule(
+        "an effect counts only where it stands out of the misfit that stays", {"misfit.physics": _sure}
+    ),
+    "simpler": Rule(
+        "an entry that contains a simpler one has to stand out against it", {"misfit._is_simpler": _no}
+    ),
+    "weakest": Rule(
+        "of effects that do not stand out the weakest leaves first", {"diagnosis.supported": _first}
+    ),
+    "clean": Rule("a residual up to 1.25 of its noise is no misfit", limits={"clean": 1.0}),
+    "coarse": Rule(
+        "a reading that rests on its steps has no certain remainder",
+        {"misfit.rounded": _fine, "levels.rounded": _fine},
+    ),
+    "timing": Rule(
+        "power at all frequencies that uncertain times may add is noise",
+        {"misfit.timing": _precise, "levels.timing": _precise},
+    ),
+    "better refit": Rule(
+        "of the two refits of a hypothesis the better one counts",
+        {"misfit.as_refitted": _ours, "confirm.as_refitted": _ours},
+    ),
+    "confirmed": Rule(
+        "a name has to predict parts that it was not fitted to", {"diagnosis.confirmed": _keeps}
+    ),
+    "unknown flow": Rule(
+        "an unknown flow is one more hypothesis where nothing else is certain",
+        {"diagnosis.flow_missing": lambda *a: Missing()},
+    ),
+    "swap": Rule(
+        "each effect of the best meets rivals in its place", {"search.swap": _nothing}, searches=True
+    ),
+    "mistakes": Rule(
+        "wrong numbers of the plant file are rivals", {"search.mistakes": _nothing}, searches=True
+    ),
+    "observer": Rule(
+        "a rig that drifts is searched with an observer, too", {"search.with_observer": _no}, searches=True
+    ),
+    "surplus": Rule(
+        "an extension with an insignificant part is kept from 5 nats over the others",
+        {"search.SURPLUS": float("inf")},
+        searches=True,
+    ),
+    "beaten": Rule(
+        "10 nats below a best that leaves only noise nothing is extended",
+        {"search.BEATEN": float("inf")},
+        searches=True,
+    ),
+    "half": Rule("a promise may be doubled", {"search.HALF": 1.0}, searches=True),
+    "laws": Rule(
+        "laws compete", {"diagnosis.with_laws": lambda case, found, limits, say: found}, searches=True
+    ),
+}
+
+
+@contextmanager
+def left_out(rule: Rule) -> Iterator[None]:
+    """Leave a rule out of the program of this process."""
+    held = []
+    for name, other in rule.without.items():
+        module, attribute = name.rsplit(".", 1)
+        of = importlib.import_module(f"thermoctl.diagnose.{module}")
+        held.append((of, attribute, getattr(of, attribute)))
+        setattr(of, attribute, other)
+    try:
+        yield
+    finally:
+        for of, attribute, value in held:
+            setattr(of, attribute, value)
+
+
+def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, str | None]:
+    """Return the result of one case that is decided without a rule, or what failed."""
+    rule = RULES[name]
+    numbers = dataclasses.replace(limits(), **rule.limits)
+    with one_thread(), left_out(rule):
+        try:
+            found = sought(job, numbers) if rule.searches else kept(folder / job.name)
+            return contract(engine.decided(dataclasses.replace(found, limits=numbers))), None
+        except Exception as e:  # a crash is a result
+            return None, f"{type(e).__name__}: {e}"
+
+
+def present(found: Sequence[Case], folder: Path) -> dict[str, Row]:
+    """Judge the kept results with all rules."""
+    rows = {}
+    for c in found:
+        result, run = outcome(c.job, folder)
+        rows[c.job.name] = row(c, result, 0.0, run["error"])
+    return rows
+
+
+def line(what: str, rows: Mapping[str, Row]) -> str:
+    """Return right names, strays and log score of each group as a row of Markdown."""
+    cells = []
+    for group in GROUPS:
+        of = [r for r in rows.values() if r["group"] == group]
+        if of:
+            f = figures(of)
+            cells.append(f"{f['right names'].split(' ')[0]}, {f['strays at 0.9']}, {f['log score']}")
+    return f"| {what} | {' | '.join(cells)} |"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command."""
+    p = argparse.ArgumentParser(prog="python -m tests.truth.ablate", description=__doc__.splitlines()[0])
+    p.add_argument("rules", nargs="*", metavar="RULE", help="default: all of the decision")
+    p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
+    p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
+    p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    p.add_argument("--out", type=Path, default=Path("build/truth"), help="folder of make truth")
+    p.add_argument(
+        "--search", action="store_true", help="the rules of the search: each case is searched again"
+    )
+    a = p.parse_args(argv)
+    folder = a.out / "diagnoses"
+    found = [c for c in cases(a) if (folder / c.job.name / KEPT).exists()]
+    if not found:
+        print("no kept search: run make truth first", file=sys.stderr)
+        return 2
+    base = present(found, folder)
+    groups = [title for g, title in GROUPS.items() if any(r["group"] == g for r in base.values())]
+    print(
+        f"| without | {' | '.join(groups)} |\n{'|---' * (len(groups) + 1)}|\n{line('nothing: all rules', base)}"
+    )
+    changed = {}
+    with ProcessPoolExecutor(a.workers) as pool:
+        for name in a.rules or [n for n, r in RULES.items() if r.searches == a.search]:
+            results = pool.map(without, [name] * len(found), [c.job for c in found], [folder] * len(found))
+            rows = {c.job.name: row(c, *r[:1], 0.0, r[1]) for c, r in zip(found, results, strict=True)}
+            print(line(name, rows), flush=True)
+            changed[name] = changes(base, rows)
+    for name, of in changed.items():
+        print(f"\n{name}: {RULES[name].says}")
+        print("\n".join(f"- {case}: *{kind}* {what}" for case, kind, what in of if kind != "verdict"))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
