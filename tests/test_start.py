@@ -14,9 +14,19 @@ FORBIDDEN = {  # by command: modules that it has no use for
     "--help": {*SLOW, "numpy", "pyarrow", "rich", "scipy"},
     "status --config config/simulated.yaml": {*SLOW, "pyarrow", "rich", "scipy", "thermoctl.control.law"},
     "status --config config/wire.yaml": {*SLOW, "pyarrow", "rich", "scipy", "thermoctl.control.law"},
-    "check --config config/simulated.yaml": {*PLOTS, "scipy.stats", "scipy.signal", "thermoctl.diagnose.fit"},
-    "effects": {*SLOW, "scipy", "thermoctl.diagnose.fit"},
-    "diagnose --explain nothing": {*SLOW, "scipy", "thermoctl.diagnose.fit", "thermoctl.fleet.commands"},
+    "check --config config/simulated.yaml": {
+        *PLOTS,
+        "scipy.stats",
+        "scipy.signal",
+        "thermoctl.diagnose.evidence.fit",
+    },
+    "effects": {*SLOW, "scipy", "thermoctl.diagnose.evidence.fit"},
+    "diagnose --explain nothing": {
+        *SLOW,
+        "scipy",
+        "thermoctl.diagnose.evidence.fit",
+        "thermoctl.fleet.commands",
+    },
     "recordings list": {*SLOW, "scipy", "thermoctl.plant.simulate"},
     "devices list": {*SLOW, "scipy", "thermoctl.plant.simulate"},
 }

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.report.words import NEXT
 from thermoctl.diagnose.result import contract

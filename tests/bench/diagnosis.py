@@ -32,19 +32,19 @@ import numpy as np
 
 from tests.proof import cases as proof_cases
 from tests.proof import score as scoring
-from thermoctl.diagnose.candidates import Candidate, candidates
-from thermoctl.diagnose.case import Budget, Case, case
-from thermoctl.diagnose.catalogue import catalogue
-from thermoctl.diagnose.extend import extend
-from thermoctl.diagnose.fit import Fitted, Placed, as_refitted, fitted
-from thermoctl.diagnose.gains import Direction, parameter_values
-from thermoctl.diagnose.held_out import worth
+from thermoctl.diagnose.data.case import Budget, Case, case
+from thermoctl.diagnose.evidence.fit import Fitted, Placed, as_refitted, fitted
+from thermoctl.diagnose.evidence.held_out import worth
+from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.overlay import Trajectory
-from thermoctl.diagnose.roles import Structure
 from thermoctl.diagnose.run import diagnose_files
-from thermoctl.diagnose.screen import groups_of, sharpened
-from thermoctl.diagnose.screening import screened
+from thermoctl.diagnose.search.extend import extend
+from thermoctl.diagnose.search.gains import Direction, parameter_values
+from thermoctl.diagnose.search.overlay import Trajectory
+from thermoctl.diagnose.search.screen import groups_of, sharpened
+from thermoctl.diagnose.search.screening import screened
 from thermoctl.fleet.jobs import Job
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load

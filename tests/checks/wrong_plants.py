@@ -14,8 +14,8 @@ from pathlib import Path
 from tests.checks.rigs import PLANTS, rig
 from tests.checks.test_checks import DAMAGES, WRONG
 from thermoctl.checks import checks
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.diagnosis import diagnose
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.result import contract
 from thermoctl.plant import Plant, loads

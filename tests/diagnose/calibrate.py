@@ -29,12 +29,12 @@ import numpy as np
 import yaml
 
 from tests.proof.rigs import RIGS, Rig
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue, contained
-from thermoctl.diagnose.decide import Key, Posterior, weigh
+from thermoctl.diagnose.evidence.odds import rare
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue, contained
 from thermoctl.diagnose.limits import Limits, limits
-from thermoctl.diagnose.misfit import Energy, standing
-from thermoctl.diagnose.mistakes import MISTAKES
-from thermoctl.diagnose.odds import rare
+from thermoctl.diagnose.search.mistakes import MISTAKES
+from thermoctl.diagnose.verdict.decide import Key, Posterior, weigh
+from thermoctl.diagnose.verdict.misfit import Energy, standing
 from thermoctl.plant import load
 
 NUMBERS = {

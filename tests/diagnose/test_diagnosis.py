@@ -10,13 +10,13 @@ from scipy.signal import cont2discrete, dlsim, lsim
 
 from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TANK, TWO_BLOCKS
 from thermoctl.cli import main
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.fit import Placed, fitted
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.evidence.fit import Placed, fitted
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.result import doubts
-from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table

@@ -9,13 +9,13 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t, norm
 
-from thermoctl.diagnose.candidates import Candidate, candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import catalogue
-from thermoctl.diagnose.extend import extend
-from thermoctl.diagnose.fit import Placed, Posterior, evidence_at, fitted, log_density
-from thermoctl.diagnose.gains import Direction
-from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
+from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnose.hypothesis.roles import Structure
+from thermoctl.diagnose.search.extend import extend
+from thermoctl.diagnose.search.gains import Direction
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -6,10 +6,10 @@ import numpy as np
 
 from tests.plants import FREE_CARRIAGE, ONE_BLOCK
 from thermoctl.diagnose import search
-from thermoctl.diagnose.case import Budget, case
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.hypothesis.rig import Rig
 from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.observer import drifts, held, linear
-from thermoctl.diagnose.rig import Rig
+from thermoctl.diagnose.search.observer import drifts, held, linear
 from thermoctl.plant import loads
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import SimulationError, compile_plant

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.plants import ONE_BLOCK
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.fit import Placed, fitted
-from thermoctl.diagnose.onsets import moved
-from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.evidence.fit import Placed, fitted
+from thermoctl.diagnose.evidence.onsets import moved
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.plants import FREE_CARRIAGE
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.catalogue import catalogue
-from thermoctl.diagnose.extend import ranges_of
-from thermoctl.diagnose.gains import Direction
-from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.search import free_starts
-from thermoctl.diagnose.shapes import shape_grid
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnose.search.beam import free_starts
+from thermoctl.diagnose.search.extend import ranges_of
+from thermoctl.diagnose.search.gains import Direction
+from thermoctl.diagnose.search.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

@@ -13,9 +13,9 @@ import pytest
 from tests.plants import ONE_BLOCK
 from thermoctl import shipped
 from thermoctl.diagnose import search
-from thermoctl.diagnose.case import Budget
 from thermoctl.diagnose.commands import on_interrupt
-from thermoctl.diagnose.progress import Pace
+from thermoctl.diagnose.data.case import Budget
+from thermoctl.diagnose.data.progress import Pace
 from thermoctl.diagnose.run import diagnose
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from tests.bench.scale import block_plant, recorded
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import catalogue
-from thermoctl.diagnose.fit import fitted
-from thermoctl.diagnose.overlay import Trajectory
-from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import directions, groups_of, screen
-from thermoctl.diagnose.screening import ROWS, Plain, Rows
-from thermoctl.diagnose.sketch import SKETCHES, likeliest, products
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.evidence.fit import fitted
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnose.hypothesis.roles import Structure
+from thermoctl.diagnose.search.overlay import Trajectory
+from thermoctl.diagnose.search.screen import directions, groups_of, screen
+from thermoctl.diagnose.search.screening import ROWS, Plain, Rows
+from thermoctl.diagnose.search.sketch import SKETCHES, likeliest, products
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from tests.laws.rigs import LAWS, RATIOS, RELAYS, STORAGES, Made, Truth, drawn, make
-from thermoctl.diagnose.catalogue import catalogue
 from thermoctl.diagnose.diagnosis import diagnose
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
 from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.refit import law_rate
 from thermoctl.diagnose.limits import limits

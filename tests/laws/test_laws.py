@@ -16,12 +16,14 @@ from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
 from tests.plants import TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import catalogue
+from thermoctl.diagnose.data.case import Budget, case
 from thermoctl.diagnose.diagnosis import diagnose
+from thermoctl.diagnose.evidence.fit import fitted
 from thermoctl.diagnose.experiment.propose import propose, survivors
-from thermoctl.diagnose.fit import fitted
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.law.forms import Term, families, library
 from thermoctl.diagnose.law.propose import PROPOSALS
 from thermoctl.diagnose.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
@@ -31,8 +33,6 @@ from thermoctl.diagnose.law.signals import Place, Signal, signals
 from thermoctl.diagnose.law.smooth import tracked
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.report.words import law_sentence
-from thermoctl.diagnose.rig import Rig
-from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant

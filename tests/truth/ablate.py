@@ -28,7 +28,7 @@ from thermoctl.diagnose import diagnosis as engine
 from thermoctl.diagnose.limits import limits
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.unknown_flow import Missing
+from thermoctl.diagnose.verdict.unknown_flow import Missing
 from thermoctl.fleet.jobs import Job, outcome
 
 
@@ -81,10 +81,12 @@ def _fine(case: Any) -> list[bool]:
 RULES: Mapping[str, Rule] = {
     "temperature": Rule("differences in log evidence are divided by 1.5", limits={"temperature": 1.0}),
     "misfit": Rule(
-        "an effect counts only where it stands out of the misfit that stays", {"misfit.physics": _sure}
+        "an effect counts only where it stands out of the misfit that stays",
+        {"verdict.misfit.physics": _sure},
     ),
     "simpler": Rule(
-        "an entry that contains a simpler one has to stand out against it", {"misfit._is_simpler": _no}
+        "an entry that contains a simpler one has to stand out against it",
+        {"verdict.misfit._is_simpler": _no},
     ),
     "weakest": Rule(
         "of effects that do not stand out the weakest leaves first", {"diagnosis.supported": _first}
@@ -92,15 +94,15 @@ RULES: Mapping[str, Rule] = {
     "clean": Rule("a residual up to 1.25 of its noise is no misfit", limits={"clean": 1.0}),
     "coarse": Rule(
         "a reading that rests on its steps has no certain remainder",
-        {"misfit.rounded": _fine, "levels.rounded": _fine},
+        {"verdict.misfit.rounded": _fine, "evidence.levels.rounded": _fine},
     ),
     "timing": Rule(
         "power at all frequencies that uncertain times may add is noise",
-        {"misfit.timing": _precise, "levels.timing": _precise},
+        {"verdict.misfit.timing": _precise, "evidence.levels.timing": _precise},
     ),
     "better refit": Rule(
         "of the two refits of a hypothesis the better one counts",
-        {"misfit.as_refitted": _ours, "confirm.as_refitted": _ours},
+        {"verdict.misfit.as_refitted": _ours, "verdict.confirm.as_refitted": _ours},
     ),
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnosis.confirmed": _keeps}
@@ -110,25 +112,27 @@ RULES: Mapping[str, Rule] = {
         {"diagnosis.flow_missing": lambda *a: Missing()},
     ),
     "swap": Rule(
-        "each effect of the best meets rivals in its place", {"search.swap": _nothing}, searches=True
+        "each effect of the best meets rivals in its place", {"search.beam.swap": _nothing}, searches=True
     ),
     "mistakes": Rule(
-        "wrong numbers of the plant file are rivals", {"search.mistakes": _nothing}, searches=True
+        "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True
     ),
     "observer": Rule(
-        "a rig that drifts is searched with an observer, too", {"search.with_observer": _no}, searches=True
+        "a rig that drifts is searched with an observer, too",
+        {"search.beam.with_observer": _no},
+        searches=True,
     ),
     "surplus": Rule(
         "an extension with an insignificant part is kept from 5 nats over the others",
-        {"search.SURPLUS": float("inf")},
+        {"search.beam.SURPLUS": float("inf")},
         searches=True,
     ),
     "beaten": Rule(
         "10 nats below a best that leaves only noise nothing is extended",
-        {"search.BEATEN": float("inf")},
+        {"search.beam.BEATEN": float("inf")},
         searches=True,
     ),
-    "half": Rule("a promise may be doubled", {"search.HALF": 1.0}, searches=True),
+    "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "laws": Rule(
         "laws compete", {"diagnosis.with_laws": lambda case, found, limits, say: found}, searches=True
     ),

@@ -13,8 +13,8 @@ from typing import Any, cast
 
 from thermoctl import __version__
 from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose.case import Budget
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.data.case import Budget
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import Limits, limits
 from thermoctl.diagnose.result import contract
 from thermoctl.diagnose.threads import one_thread

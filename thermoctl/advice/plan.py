@@ -20,13 +20,13 @@ import numpy as np
 from thermoctl.advice.effect_files import made_rig
 from thermoctl.checks import Finding
 from thermoctl.checks.model import plant_findings, rates_of
-from thermoctl.diagnose.candidates import candidates
-from thermoctl.diagnose.case import Budget, case
-from thermoctl.diagnose.catalogue import Effect
-from thermoctl.diagnose.decide import Key
+from thermoctl.diagnose.data.case import Budget, case
+from thermoctl.diagnose.evidence.fit import UNIFORM, as_refitted, fitted
 from thermoctl.diagnose.experiment.design import NONE, Excitation, Lever, Limits, courses, family, levers
-from thermoctl.diagnose.fit import UNIFORM, as_refitted, fitted
+from thermoctl.diagnose.hypothesis.candidates import candidates
+from thermoctl.diagnose.hypothesis.catalogue import Effect
 from thermoctl.diagnose.report.unseen import NOT_EXCITED, Visible, sized, visible
+from thermoctl.diagnose.verdict.decide import Key
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.residuals import Problem

@@ -18,8 +18,8 @@ from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.results import Diagnosis, Simulation, joined
 from thermoctl.checks import Finding, checks
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.diagnosis import diagnose as _diagnose
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import limits
 from thermoctl.plant import from_plain, load
 from thermoctl.plant.initial import last_state, with_start

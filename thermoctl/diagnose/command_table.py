@@ -9,7 +9,7 @@ TABLE: Table = {
         command(
             "noise",
             "learn each sensor's own noise from quiet recordings; write the plant file with it",
-            "thermoctl.diagnose.sensor_noise:command",
+            "thermoctl.diagnose.data.sensor_noise:command",
             "",
             PLANT,
             RECORDINGS,

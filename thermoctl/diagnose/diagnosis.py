@@ -5,25 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from thermoctl.diagnose.case import Budget, Case, case
-from thermoctl.diagnose.catalogue import Effect, contained
-from thermoctl.diagnose.confirm import Confirm, confirmed
-from thermoctl.diagnose.decide import Decision, Facts, Key, Posterior, decide, weigh
-from thermoctl.diagnose.fit import Fitted, as_refitted, with_residuals
-from thermoctl.diagnose.held_out import split, worth
+from thermoctl.diagnose.data.case import Budget, Case, case
+from thermoctl.diagnose.data.memory import NOTHING, Memory
+from thermoctl.diagnose.evidence.fit import Fitted, as_refitted, with_residuals
+from thermoctl.diagnose.evidence.held_out import split, worth
+from thermoctl.diagnose.evidence.levels import remainder
+from thermoctl.diagnose.evidence.unknown import left, reached
+from thermoctl.diagnose.hypothesis.candidates import Key
+from thermoctl.diagnose.hypothesis.catalogue import Effect, contained
 from thermoctl.diagnose.law.contest import with_laws
 from thermoctl.diagnose.law.find import Law, found_law
 from thermoctl.diagnose.law.forms import LAW
 from thermoctl.diagnose.law.smooth import missing_flow
-from thermoctl.diagnose.levels import remainder
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.memory import NOTHING, Memory
-from thermoctl.diagnose.misfit import energies, standing, supported
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.search import Keys, Searched, Weighed, search
+from thermoctl.diagnose.search.beam import Keys, Searched, Weighed, search
 from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.unknown import left, reached
-from thermoctl.diagnose.unknown_flow import Missing, flow_missing
+from thermoctl.diagnose.verdict.confirm import Confirm, confirmed
+from thermoctl.diagnose.verdict.decide import Decision, Facts, Posterior, decide, weigh
+from thermoctl.diagnose.verdict.misfit import energies, standing, supported
+from thermoctl.diagnose.verdict.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 

@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.decide import Decision, Key, Posterior
-from thermoctl.diagnose.fit import Fitted, Placed
-from thermoctl.diagnose.held_out import Worth
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted, Placed
+from thermoctl.diagnose.evidence.held_out import Worth
+from thermoctl.diagnose.evidence.levels import late
+from thermoctl.diagnose.evidence.unknown import Left
+from thermoctl.diagnose.hypothesis.candidates import Key
 from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.refit import PlacedLaw
 from thermoctl.diagnose.law.result import law_entry
 from thermoctl.diagnose.law.smooth import flow_unit
-from thermoctl.diagnose.levels import late
-from thermoctl.diagnose.misfit import Energy, standouts
-from thermoctl.diagnose.search import Searched
-from thermoctl.diagnose.unknown import Left
+from thermoctl.diagnose.search.beam import Searched
+from thermoctl.diagnose.verdict.decide import Decision, Posterior
+from thermoctl.diagnose.verdict.misfit import Energy, standouts
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import Fit

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose import memory
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.data import memory
+from thermoctl.diagnose.evidence.fit import remembered
 from thermoctl.diagnose.experiment import file as experiment_file
 from thermoctl.diagnose.experiment.design import NONE, Limits
 from thermoctl.diagnose.experiment.propose import propose
-from thermoctl.diagnose.fit import remembered
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.limits import limits as numbers
 from thermoctl.diagnose.report.page import write_report
 from thermoctl.diagnose.report.trend import earlier_trends, told, trends

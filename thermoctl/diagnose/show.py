@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from thermoctl.diagnose.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnose.report.explain import explain, why
 from thermoctl.yamlfile import InputError, suggest
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from thermoctl.diagnose.catalogue import CATALOGUE
+from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE
 from thermoctl.shipped import shipped
 
 _SOURCE = (".py", ".pyx", ".pxd", ".h")  # suffixes of code

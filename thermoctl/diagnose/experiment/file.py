@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.case import Case
+from thermoctl.diagnose.data.case import Case
 from thermoctl.diagnose.experiment.design import TOGETHER, Excitation
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table

@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.decide import Key
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted, with_residuals
 from thermoctl.diagnose.experiment.design import NONE, Excitation, Lever, Limits, family, levers
 from thermoctl.diagnose.experiment.file import FILES
-from thermoctl.diagnose.fit import Fitted, with_residuals
+from thermoctl.diagnose.hypothesis.candidates import Key
 from thermoctl.diagnose.law.result import described
 from thermoctl.diagnose.result import Diagnosis
 from thermoctl.plant.residuals import Scale

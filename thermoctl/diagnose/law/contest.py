@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import softmax
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted
+from thermoctl.diagnose.evidence.levels import only_noise
+from thermoctl.diagnose.evidence.posterior import Hypothesis
 from thermoctl.diagnose.law.find import refits
 from thermoctl.diagnose.law.forms import LAW
 from thermoctl.diagnose.law.propose import Proposal, propose_laws
-from thermoctl.diagnose.levels import only_noise
 from thermoctl.diagnose.limits import Limits
-from thermoctl.diagnose.posterior import Hypothesis
-from thermoctl.diagnose.search import BEATEN, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.diagnose.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.plant.simulate import SimulationError
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted
 from thermoctl.diagnose.law.curve import Curve, curve
 from thermoctl.diagnose.law.propose import Proposal
 from thermoctl.diagnose.law.refit import (
@@ -21,7 +21,7 @@ from thermoctl.diagnose.law.refit import (
     simpler_law,
 )
 from thermoctl.diagnose.law.smooth import law_unit, tracked
-from thermoctl.diagnose.shortlist import HALF
+from thermoctl.diagnose.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.cores import LEAST, batches, each
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl import yamlfile
-from thermoctl.diagnose.catalogue import Effect, EffectParameter
+from thermoctl.diagnose.hypothesis.catalogue import Effect, EffectParameter
 from thermoctl.diagnose.law.memory import MEMORIES
 from thermoctl.diagnose.law.signals import Place, Signal, Values
 from thermoctl.plant import expression as ex

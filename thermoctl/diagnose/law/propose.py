@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnose.evidence.unknown import located, reached
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnose.law.signals import Place, Signal, places, signals
 from thermoctl.diagnose.law.smooth import Tracked, tracked
-from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.shortlist import ALIKE
-from thermoctl.diagnose.unknown import located, reached
+from thermoctl.diagnose.search.shortlist import ALIKE
 from thermoctl.plant.residuals import HUGE
 
 PIECES = 8  # of a free function of a signal

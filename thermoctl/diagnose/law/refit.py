@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose import places as catalogue_places
-from thermoctl.diagnose.candidates import Candidate
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, Placed, fitted
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted, Placed, fitted
+from thermoctl.diagnose.hypothesis import places as catalogue_places
+from thermoctl.diagnose.hypothesis.candidates import Candidate
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.law.forms import law_effect, readable
 from thermoctl.diagnose.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnose.law.smooth import law_unit
-from thermoctl.diagnose.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.yamlfile import InputError

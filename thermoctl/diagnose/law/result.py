@@ -9,13 +9,13 @@ from typing import Any
 
 import yaml
 
-from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.held_out import Worth
+from thermoctl.diagnose.evidence.fit import Fitted
+from thermoctl.diagnose.evidence.held_out import Worth
+from thermoctl.diagnose.hypothesis.rig import zero_of
 from thermoctl.diagnose.law.find import Law
 from thermoctl.diagnose.law.propose import Proposal
 from thermoctl.diagnose.law.refit import equation, law_rate
 from thermoctl.diagnose.report.words import law_sentence
-from thermoctl.diagnose.rig import zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant

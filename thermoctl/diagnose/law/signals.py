@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermoctl.diagnose.rig import TEMPERATURE, zero_of
-from thermoctl.diagnose.roles import Structure
+from thermoctl.diagnose.hypothesis.rig import TEMPERATURE, zero_of
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.plant.units import conversion, dimension

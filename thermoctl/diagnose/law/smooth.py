@@ -20,12 +20,12 @@ import numpy as np
 from scipy.linalg import block_diag, solveh_banded
 from scipy.sparse import csr_matrix
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import Fitted, as_refitted
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnose.evidence.where import SHARES, signals, typical_flow
+from thermoctl.diagnose.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnose.law.signals import Place
-from thermoctl.diagnose.rig import TEMPERATURE
-from thermoctl.diagnose.screening import ROWS, Plain, Rows
-from thermoctl.diagnose.where import SHARES, signals, typical_flow
+from thermoctl.diagnose.search.screening import ROWS, Plain, Rows
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.diagnose.evidence.fit import Fitted, Placed
 from thermoctl.diagnose.experiment.file import peaks
-from thermoctl.diagnose.fit import Fitted, Placed
 from thermoctl.diagnose.law.result import law_section
 from thermoctl.diagnose.report.words import chance, name, sentences, what_next
 from thermoctl.diagnose.result import Diagnosis

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.fit import SIGNIFICANT, Fitted
-from thermoctl.diagnose.posterior import Placed, Posterior
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import SIGNIFICANT, Fitted
+from thermoctl.diagnose.evidence.posterior import Placed, Posterior
 from thermoctl.recording.dates import begun, line
 from thermoctl.yamlfile import InputError
 

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnose.candidates import Candidate, candidates
-from thermoctl.diagnose.case import Case
-from thermoctl.diagnose.catalogue import Effect
-from thermoctl.diagnose.fit import Fitted
-from thermoctl.diagnose.gains import NEAR, Column, parameter_values
-from thermoctl.diagnose.noise import Averaged
-from thermoctl.diagnose.overlay import Trajectory
+from thermoctl.diagnose.data.case import Case
+from thermoctl.diagnose.evidence.fit import Fitted
+from thermoctl.diagnose.evidence.noise import Averaged
+from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnose.hypothesis.catalogue import Effect
+from thermoctl.diagnose.hypothesis.roles import Structure
 from thermoctl.diagnose.result import Diagnosis
-from thermoctl.diagnose.roles import Structure
-from thermoctl.diagnose.screen import Norms, directions, groups_of
-from thermoctl.diagnose.screening import ROWS, Plain, Rows
+from thermoctl.diagnose.search.gains import NEAR, Column, parameter_values
+from thermoctl.diagnose.search.overlay import Trajectory
+from thermoctl.diagnose.search.screen import Norms, directions, groups_of
+from thermoctl.diagnose.search.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
 ABSORBED = 1e-4  # share of a direction that is left, below which the plant's own parameters imitate it

@@ -1,0 +1,1 @@
+"""The recordings of a diagnosis as rows: outliers, blocks, frequencies, and what earlier recordings left."""
