@@ -12,7 +12,7 @@ from thermoctl.calibration import command_table as calibration
 from thermoctl.command import CONFIG, PURPOSES, Command
 from thermoctl.daemon import command_table as daemon
 from thermoctl.devices import command_table as devices
-from thermoctl.diagnose import command_table as diagnose
+from thermoctl.diagnosis import command_table as diagnose
 from thermoctl.export import command_table as export
 from thermoctl.fleet import command_table as fleet
 from thermoctl.identify import command_table as identify

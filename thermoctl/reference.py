@@ -23,7 +23,7 @@ from thermoctl.configuration.settings import SECTIONS, options
 from thermoctl.configuration.which_rig import ACTS
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl_hal.base.key import REQUIRED, Key

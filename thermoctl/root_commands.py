@@ -294,10 +294,10 @@ def effects(args: argparse.Namespace) -> int:
 
         return check_effects(args)
     if args.action == "save":
-        from thermoctl.diagnose.commands import save_law
+        from thermoctl.diagnosis.commands import save_law
 
         return save_law(args)
-    from thermoctl.diagnose import show
+    from thermoctl.diagnosis import show
 
     args.name = args.files[0] if args.files else None
     return show.effects(args)
@@ -308,7 +308,7 @@ def diagnose(args: argparse.Namespace) -> int:
     from thermoctl.yamlfile import InputError
 
     if args.explain:
-        from thermoctl.diagnose.show import explained
+        from thermoctl.diagnosis.show import explained
 
         return explained(args.explain, args.why)
     for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
@@ -341,7 +341,7 @@ def diagnose(args: argparse.Namespace) -> int:
 
         record(experiment, recording, args.config, args.rig, args.yes)
 
-    from thermoctl.diagnose import commands
+    from thermoctl.diagnosis import commands
 
     args.record = record
     return commands.diagnose(args)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.report.words import NEXT
-from thermoctl.diagnose.result import contract
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report.words import NEXT
+from thermoctl.diagnosis.result import contract
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

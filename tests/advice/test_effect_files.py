@@ -7,9 +7,9 @@ import pytest
 
 from thermoctl import cli
 from thermoctl.advice.effect_files import FORMS, PARTS, SHAPES, SYMBOLS, check_file
-from thermoctl.diagnose.hypothesis.catalogue import CHANGES, KEYS, catalogue
-from thermoctl.diagnose.hypothesis.catalogue import SHAPES as catalogue_shapes
-from thermoctl.diagnose.hypothesis.places import PLACES
+from thermoctl.diagnosis.hypothesis.catalogue import CHANGES, KEYS, catalogue
+from thermoctl.diagnosis.hypothesis.catalogue import SHAPES as catalogue_shapes
+from thermoctl.diagnosis.hypothesis.places import PLACES
 from thermoctl.plant import load
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import Section

@@ -9,7 +9,7 @@ import pytest
 from tests.checks.rigs import PLANTS, inputs, rig
 from thermoctl.advice.plan import plan
 from thermoctl.cli import main
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.plant import load, loads
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant

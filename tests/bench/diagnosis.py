@@ -32,19 +32,19 @@ import numpy as np
 
 from tests.proof import cases as proof_cases
 from tests.proof import score as scoring
-from thermoctl.diagnose.data.case import Budget, Case, case
-from thermoctl.diagnose.evidence.fit import Fitted, Placed, as_refitted, fitted
-from thermoctl.diagnose.evidence.held_out import worth
-from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.run import diagnose_files
-from thermoctl.diagnose.search.extend import extend
-from thermoctl.diagnose.search.gains import Direction, parameter_values
-from thermoctl.diagnose.search.overlay import Trajectory
-from thermoctl.diagnose.search.screen import groups_of, sharpened
-from thermoctl.diagnose.search.screening import screened
+from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, as_refitted, fitted
+from thermoctl.diagnosis.evidence.held_out import worth
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.run import diagnose_files
+from thermoctl.diagnosis.search.extend import extend
+from thermoctl.diagnosis.search.gains import Direction, parameter_values
+from thermoctl.diagnosis.search.overlay import Trajectory
+from thermoctl.diagnosis.search.screen import groups_of, sharpened
+from thermoctl.diagnosis.search.screening import screened
 from thermoctl.fleet.jobs import Job
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load

@@ -24,12 +24,12 @@ import numpy as np
 
 from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge, without
 from tests.laws.rigs import Made, make
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import Fitted, as_refitted, fitted
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.law.signals import Place, signals
-from thermoctl.diagnose.law.smooth import LATENT, tracked
-from thermoctl.diagnose.limits import limits
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, fitted
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.law.signals import Place, signals
+from thermoctl.diagnosis.law.smooth import LATENT, tracked
+from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulate import compile_plant
 

@@ -35,11 +35,11 @@ STAGES = (
     ("/overlay.py", "", "screening"),
     ("/shortlist.py", "", "screening"),
     ("/unknown", "", "unknown"),
-    ("diagnose/law/smooth.py", "missing_flow", "missing flow"),
-    ("diagnose/law/", "", "law"),
+    ("/law/smooth.py", "missing_flow", "missing flow"),
+    ("/law/", "", "law"),
     ("/held_out.py", "", "held out"),
-    ("diagnose/experiment/", "", "experiment"),
-    ("diagnose/report/", "", "report"),
+    ("/experiment/", "", "experiment"),
+    ("/report/", "", "report"),
     ("thermoctl/checks/", "", "checks"),
     ("plant/units.py", "", "checks"),
     ("/case.py", "", "first refit"),
@@ -72,7 +72,7 @@ def sampled(case: Path) -> dict[str, object]:
     found: collections.Counter[str] = collections.Counter()
     signal.signal(signal.SIGPROF, lambda _, frame: found.update([stage(frame)]))
     signal.setitimer(signal.ITIMER_PROF, EVERY, EVERY)
-    from thermoctl.diagnose.run import diagnose
+    from thermoctl.diagnosis.run import diagnose
     from thermoctl.plant import load
     from thermoctl.plant.recordings import read_recordings
 

@@ -39,7 +39,7 @@ from thermoctl.recording.table import Table
 
 BODY = """
 import json, os, resource, sys, time
-from thermoctl.diagnose.run import diagnose_files
+from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.plant import residuals
 calls, side_by_side = [], residuals.each
 def timed(f, items, numbers):  # on one core these run one after the other

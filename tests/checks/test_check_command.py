@@ -6,7 +6,7 @@ import pytest
 
 from tests.checks.rigs import PLANTS, rig
 from thermoctl import cli
-from thermoctl.diagnose import run
+from thermoctl.diagnosis import run
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from tests.checks.rigs import PLANTS, rig
 from tests.checks.test_checks import DAMAGES, WRONG
 from thermoctl.checks import checks
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.result import contract
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
 from thermoctl.plant import Plant, loads
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

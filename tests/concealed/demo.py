@@ -31,7 +31,7 @@ from tests.concealed import generate, sensors
 from tests.concealed.judge import snr
 from tests.concealed.rig import Scene
 from thermoctl.calibration.iso230 import mean_and_two_s
-from thermoctl.diagnose import run as diagnosis
+from thermoctl.diagnosis import run as diagnosis
 from thermoctl.fleet.jobs import program
 from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save

@@ -29,12 +29,12 @@ import numpy as np
 import yaml
 
 from tests.proof.rigs import RIGS, Rig
-from thermoctl.diagnose.evidence.odds import rare
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue, contained
-from thermoctl.diagnose.limits import Limits, limits
-from thermoctl.diagnose.search.mistakes import MISTAKES
-from thermoctl.diagnose.verdict.decide import Key, Posterior, weigh
-from thermoctl.diagnose.verdict.misfit import Energy, standing
+from thermoctl.diagnosis.evidence.odds import rare
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue, contained
+from thermoctl.diagnosis.limits import Limits, limits
+from thermoctl.diagnosis.search.mistakes import MISTAKES
+from thermoctl.diagnosis.verdict.decide import Key, Posterior, weigh
+from thermoctl.diagnosis.verdict.misfit import Energy, standing
 from thermoctl.plant import load
 
 NUMBERS = {

@@ -1,4 +1,4 @@
-"""Size of the diagnosis: `python -m tests.diagnose.count [FOLDER ...]` (default: thermoctl/diagnose and its folders).
+"""Size of the diagnosis: `python -m tests.diagnose.count [FOLDER ...]` (default: thermoctl/diagnosis and its folders).
 
 A FOLDER of an older checkout is counted in the same way. A branch is an if, a loop, an except, a comprehension, or a
 Boolean operator. Named numbers are names in capitals of a module that hold numbers.
@@ -10,9 +10,10 @@ import ast
 import sys
 from pathlib import Path
 
-from thermoctl.diagnose.limits import limits
+from thermoctl.diagnosis.limits import limits
 
-FOLDERS = ("thermoctl/diagnose", *(f"thermoctl/diagnose/{part}" for part in ("law", "experiment", "report")))
+ROOMS = sorted(p.parent for p in Path("thermoctl/diagnosis").glob("*/__init__.py"))
+FOLDERS = ("thermoctl/diagnosis", *map(str, ROOMS))
 BRANCHES = (ast.If, ast.For, ast.While, ast.BoolOp, ast.IfExp, ast.comprehension, ast.ExceptHandler)
 
 

@@ -23,7 +23,7 @@ import yaml
 
 from tests.concealed.generate import NotVisible, make_case
 from tests.diagnose.changes import CHANGES, PLAIN, SEED, Change, Rig, thinned
-from thermoctl.diagnose.run import diagnose_files
+from thermoctl.diagnosis.run import diagnose_files
 
 CLOSE = 0.02  # probabilities that differ by less are the same (issue 23)
 EITHER_WAY = ("missing_link", "bending")  # their two places may be named in either order

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
-from thermoctl.diagnose.verdict.confirm import Confirm, confirmed, signed_rank
-from thermoctl.diagnose.verdict.decide import Posterior
+from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, signed_rank
+from thermoctl.diagnosis.verdict.decide import Posterior
 
 A, B = ("radiation", "block"), ("sensor_drift", "reading")
 NONE, ONE, BOTH = frozenset(), frozenset({A}), frozenset({A, B})

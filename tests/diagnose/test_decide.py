@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.verdict.decide import Facts, decide, weigh
-from thermoctl.diagnose.verdict.misfit import Energy, physics, standing, supported
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.verdict.decide import Facts, decide, weigh
+from thermoctl.diagnosis.verdict.misfit import Energy, physics, standing, supported
 
 A, B = ("radiation", "block"), ("natural_convection", "block")
 NOTHING, ONE, OTHER, BOTH = frozenset(), frozenset({A}), frozenset({B}), frozenset({A, B})

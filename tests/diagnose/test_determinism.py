@@ -11,7 +11,8 @@ import pytest
 from scipy.linalg import blas
 
 from tests.diagnose.test_engine import LAGGED, _write, written
-from thermoctl.diagnose import diagnosis, threads
+from thermoctl.diagnosis import diagnose as diagnosis
+from thermoctl.diagnosis import threads
 from thermoctl.yamlfile import InputError
 
 

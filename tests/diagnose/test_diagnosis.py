@@ -10,13 +10,13 @@ from scipy.signal import cont2discrete, dlsim, lsim
 
 from tests.plants import FREE_CARRIAGE, SPRING_STAGE, TANK, TWO_BLOCKS
 from thermoctl.cli import main
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import Placed, fitted
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.hypothesis.rig import Rig
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.result import doubts
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.result import doubts
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.files import read_table

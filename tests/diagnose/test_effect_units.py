@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.plants import VOICE_COIL
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import load, save
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

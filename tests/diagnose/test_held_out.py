@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from thermoctl.diagnose.evidence.held_out import worse
+from thermoctl.diagnosis.evidence.held_out import worse
 
 
 def errors(seed: int) -> tuple[list[np.ndarray], np.ndarray]:

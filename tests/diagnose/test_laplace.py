@@ -9,13 +9,13 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t, norm
 
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
-from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.search.extend import extend
-from thermoctl.diagnose.search.gains import Direction
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.search.extend import extend
+from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -6,13 +6,13 @@ import pytest
 
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.result import contract
-from thermoctl.diagnose.search.mistakes import MISTAKES
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
+from thermoctl.diagnosis.search.mistakes import MISTAKES
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 

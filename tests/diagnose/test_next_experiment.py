@@ -10,15 +10,15 @@ import pytest
 import yaml
 
 from thermoctl.cli import main
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.experiment import file as experiment_file
-from thermoctl.diagnose.experiment.design import Excitation, courses, levers
-from thermoctl.diagnose.experiment.file import peaks
-from thermoctl.diagnose.experiment.propose import bits, distances, propose
-from thermoctl.diagnose.experiment.resolve import resolve
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.search.beam import search
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.experiment import file as experiment_file
+from thermoctl.diagnosis.experiment.design import Excitation, courses, levers
+from thermoctl.diagnosis.experiment.file import peaks
+from thermoctl.diagnosis.experiment.propose import bits, distances, propose
+from thermoctl.diagnosis.experiment.resolve import resolve
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.search.beam import search
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant

@@ -11,14 +11,14 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.special import logsumexp
 
-from thermoctl.diagnose.data.coordinates import Coordinates, transform
-from thermoctl.diagnose.data.grids import Grid, grid
-from thermoctl.diagnose.data.spectra import SLOW, slow_parts
-from thermoctl.diagnose.evidence import noise as module
-from thermoctl.diagnose.evidence.densities import NOISE, REMAINDER
-from thermoctl.diagnose.evidence.densities import SLOW as SLOW_NOISE
-from thermoctl.diagnose.evidence.levels import floor
-from thermoctl.diagnose.evidence.noise import Around, Averaged, averaged
+from thermoctl.diagnosis.data.coordinates import Coordinates, transform
+from thermoctl.diagnosis.data.grids import Grid, grid
+from thermoctl.diagnosis.data.spectra import SLOW, slow_parts
+from thermoctl.diagnosis.evidence import noise as module
+from thermoctl.diagnosis.evidence.densities import NOISE, REMAINDER
+from thermoctl.diagnosis.evidence.densities import SLOW as SLOW_NOISE
+from thermoctl.diagnosis.evidence.levels import floor
+from thermoctl.diagnosis.evidence.noise import Around, Averaged, averaged
 from thermoctl.plant.simulate import Excitation
 
 ROWS, SIGMA, SWING = 2000, 0.05, 5.0

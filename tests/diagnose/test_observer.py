@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from tests.plants import FREE_CARRIAGE, ONE_BLOCK
-from thermoctl.diagnose import search
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.hypothesis.rig import Rig
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.search.observer import drifts, held, linear
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.search import beam as search
+from thermoctl.diagnosis.search.observer import drifts, held, linear
 from thermoctl.plant import loads
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import SimulationError, compile_plant

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.plants import ONE_BLOCK
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import Placed, fitted
-from thermoctl.diagnose.evidence.onsets import moved
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.evidence.onsets import moved
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

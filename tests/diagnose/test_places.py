@@ -7,13 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.plants import FREE_CARRIAGE
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.rig import Rig
-from thermoctl.diagnose.search.beam import free_starts
-from thermoctl.diagnose.search.extend import ranges_of
-from thermoctl.diagnose.search.gains import Direction
-from thermoctl.diagnose.search.shapes import shape_grid
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.search.beam import free_starts
+from thermoctl.diagnosis.search.extend import ranges_of
+from thermoctl.diagnosis.search.gains import Direction
+from thermoctl.diagnosis.search.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

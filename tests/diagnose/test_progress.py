@@ -12,11 +12,11 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from thermoctl import shipped
-from thermoctl.diagnose import search
-from thermoctl.diagnose.commands import on_interrupt
-from thermoctl.diagnose.data.case import Budget
-from thermoctl.diagnose.data.progress import Pace
-from thermoctl.diagnose.run import diagnose
+from thermoctl.diagnosis.commands import on_interrupt
+from thermoctl.diagnosis.data.case import Budget
+from thermoctl.diagnosis.data.progress import Pace
+from thermoctl.diagnosis.run import diagnose
+from thermoctl.diagnosis.search import beam as search
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

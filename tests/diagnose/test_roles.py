@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
-from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.search.overlay import Overlay, Trajectory
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import compile_plant

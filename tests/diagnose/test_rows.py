@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.plants import ONE_BLOCK
-from thermoctl.diagnose.data.rows import CHANCE, LONG, _content, reduced
+from thermoctl.diagnosis.data.rows import CHANCE, LONG, _content, reduced
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.refit import fit

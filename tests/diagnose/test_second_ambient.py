@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.plants import TWO_BLOCKS
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.search.beam import _followed, started
-from thermoctl.diagnose.search.screening import screened
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.search.beam import _followed, started
+from thermoctl.diagnosis.search.screening import screened
 from thermoctl.plant import loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

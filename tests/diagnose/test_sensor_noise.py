@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from thermoctl.cli import main
-from thermoctl.diagnose.data.spectra import spectrum
+from thermoctl.diagnosis.data.spectra import spectrum
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
 from thermoctl.recording.files import write_table

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-from thermoctl.diagnose.search.gains import PLACES_EACH, Direction, foremost, once
+from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
 
 
 def _direction(effect: str, where: str, gain: float) -> Direction:

@@ -8,8 +8,8 @@ import threading
 import numpy as np
 
 from tests.plants import ONE_BLOCK
-from thermoctl.diagnose import search
-from thermoctl.diagnose.run import diagnose
+from thermoctl.diagnosis.run import diagnose
+from thermoctl.diagnosis.search import beam as search
 from thermoctl.plant import cores, load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

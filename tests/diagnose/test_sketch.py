@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from tests.bench.scale import block_plant, recorded
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import fitted
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.search.overlay import Trajectory
-from thermoctl.diagnose.search.screen import directions, groups_of, screen
-from thermoctl.diagnose.search.screening import ROWS, Plain, Rows
-from thermoctl.diagnose.search.sketch import SKETCHES, likeliest, products
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import fitted
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.search.overlay import Trajectory
+from thermoctl.diagnosis.search.screen import directions, groups_of, screen
+from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.diagnosis.search.sketch import SKETCHES, likeliest, products
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 
@@ -55,7 +55,6 @@ def test_sketched_products_are_those_of_the_rows(chain):
 def test_what_a_sketch_keeps_holds_the_best_directions(chain, monkeypatch):
     metric, rig, found, _ = chain
     (every,) = screen([metric], rig, found)
-    # by module: as an attribute, thermoctl.diagnose may be the function of the API
     monkeypatch.setattr(sys.modules[screen.__module__], "EXACT", 0)
     monkeypatch.setattr(sys.modules[likeliest.__module__], "KEPT", 300)
     (kept,) = screen([metric], rig, found, select=likeliest)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.plants import TANK
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.search.beam import started
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.search.beam import started
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

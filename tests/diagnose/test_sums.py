@@ -7,13 +7,13 @@ import pytest
 from scipy.linalg import block_diag
 
 from tests.diagnose.test_workers import rig
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import as_refitted, fitted, with_residuals
-from thermoctl.diagnose.evidence.posterior import Posterior
-from thermoctl.diagnose.law.smooth import _smoothed
-from thermoctl.diagnose.run import diagnose
-from thermoctl.diagnose.search.overlay import _filtered
-from thermoctl.diagnose.search.screening import FREE, ROWS, Plain, Rows
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import as_refitted, fitted, with_residuals
+from thermoctl.diagnosis.evidence.posterior import Posterior
+from thermoctl.diagnosis.law.smooth import _smoothed
+from thermoctl.diagnosis.run import diagnose
+from thermoctl.diagnosis.search.overlay import _filtered
+from thermoctl.diagnosis.search.screening import FREE, ROWS, Plain, Rows
 from thermoctl.plant import residuals
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.plants import SPRING_STAGE
-from thermoctl.diagnose.run import diagnose
+from thermoctl.diagnosis.run import diagnose
 from thermoctl.plant import load
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

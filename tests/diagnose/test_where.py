@@ -7,8 +7,8 @@ from scipy.fft import dct
 
 from tests.diagnose.changes import order
 from tests.diagnose.test_roles import blocks
-from thermoctl.diagnose.data.coordinates import Coordinates
-from thermoctl.diagnose.evidence.where import responses, white_forces
+from thermoctl.diagnosis.data.coordinates import Coordinates
+from thermoctl.diagnosis.evidence.where import responses, white_forces
 from thermoctl.plant import from_plain
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from thermoctl.cli import main
-from thermoctl.diagnose.report.explain import explain, why
-from thermoctl.diagnose.report.words import sentences, words
+from thermoctl.diagnosis.report.explain import explain, why
+from thermoctl.diagnosis.report.words import sentences, words
 
 LAG = {
     "confirmed": 0.996,

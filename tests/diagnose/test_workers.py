@@ -10,9 +10,9 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from tests.proof.test_proof import a_dask_by_hand
-from thermoctl.diagnose import workers as dask_workers
-from thermoctl.diagnose.run import diagnose
-from thermoctl.diagnose.workers import cluster
+from thermoctl.diagnosis import workers as dask_workers
+from thermoctl.diagnosis.run import diagnose
+from thermoctl.diagnosis.workers import cluster
 from thermoctl.plant import load
 from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import compile_plant

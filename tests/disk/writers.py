@@ -19,8 +19,8 @@ from thermoctl.control.model import zero_model
 from thermoctl.daemon import keep, service
 from thermoctl.daemon.views import demo
 from thermoctl.devices import new as devices_new
-from thermoctl.diagnose import run as diagnosis
-from thermoctl.diagnose.law.result import save_effect
+from thermoctl.diagnosis import run as diagnosis
+from thermoctl.diagnosis.law.result import save_effect
 from thermoctl.identify import modelfile, tuning
 from thermoctl.plant import load
 from thermoctl.recording.files import read_table

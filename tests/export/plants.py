@@ -3,9 +3,9 @@
 import numpy as np
 
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import Plant, load, loads
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table

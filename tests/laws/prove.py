@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from tests.laws.rigs import LAWS, RATIOS, RELAYS, STORAGES, Made, Truth, drawn, make
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.law.find import Law
-from thermoctl.diagnose.law.refit import law_rate
-from thermoctl.diagnose.limits import limits
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.refit import law_rate
+from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
 from thermoctl.plant.estimate import updated
 from thermoctl.plant.language import Input, Parameter, Plant

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.proof.rigs import RIGS, Rig
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.law.result import law_entry
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.report.words import law_sentence
-from thermoctl.diagnose.result import Diagnosis
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.law.result import law_entry
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

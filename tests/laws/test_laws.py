@@ -16,23 +16,23 @@ from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
 from tests.plants import TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.evidence.fit import fitted
-from thermoctl.diagnose.experiment.propose import propose, survivors
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.rig import Rig
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.law.forms import Term, families, library
-from thermoctl.diagnose.law.propose import PROPOSALS
-from thermoctl.diagnose.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
-from thermoctl.diagnose.law.refit import law_of as placed_law
-from thermoctl.diagnose.law.result import law_entry, law_section, save_effect
-from thermoctl.diagnose.law.signals import Place, Signal, signals
-from thermoctl.diagnose.law.smooth import tracked
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.report.words import law_sentence
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.evidence.fit import fitted
+from thermoctl.diagnosis.experiment.propose import propose, survivors
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.law.forms import Term, families, library
+from thermoctl.diagnosis.law.propose import PROPOSALS
+from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
+from thermoctl.diagnosis.law.refit import law_of as placed_law
+from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect
+from thermoctl.diagnosis.law.signals import Place, Signal, signals
+from thermoctl.diagnosis.law.smooth import tracked
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from tests.export.plants import plants, recording
 from thermoctl import yamlfile
-from thermoctl.diagnose.diagnosis import diagnose
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.result import contract
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
 from thermoctl.plant import Plant, load
 from thermoctl.plant.fmu import opened

@@ -11,9 +11,9 @@ import pytest
 import thermoctl as tc
 from tests.plant.fmu_back import as_fmu
 from thermoctl import cli
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import catalogue
-from thermoctl.diagnose.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.export.commands import write
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant.fmu import opened

@@ -24,11 +24,11 @@ from tests.truth.__main__ import GROUPS, cases
 from tests.truth.cases import Case
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import KEPT, kept, sought
-from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose.limits import limits
-from thermoctl.diagnose.result import contract
-from thermoctl.diagnose.threads import one_thread
-from thermoctl.diagnose.verdict.unknown_flow import Missing
+from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
+from thermoctl.diagnosis.threads import one_thread
+from thermoctl.diagnosis.verdict.unknown_flow import Missing
 from thermoctl.fleet.jobs import Job, outcome
 
 
@@ -36,7 +36,7 @@ from thermoctl.fleet.jobs import Job, outcome
 class Rule:
     """A rule, where it stands, and how to leave it out.
 
-    - `without`: name of the program (below thermoctl.diagnose) to what takes its place
+    - `without`: name of the program (below thermoctl.diagnosis) to what takes its place
     - `limits`: numbers of config/diagnosis.yaml in place of theirs
     - `searches`: it acts in the search, else in the decision"""
 
@@ -89,7 +89,7 @@ RULES: Mapping[str, Rule] = {
         {"verdict.misfit._is_simpler": _no},
     ),
     "weakest": Rule(
-        "of effects that do not stand out the weakest leaves first", {"diagnosis.supported": _first}
+        "of effects that do not stand out the weakest leaves first", {"diagnose.supported": _first}
     ),
     "clean": Rule("a residual up to 1.25 of its noise is no misfit", limits={"clean": 1.0}),
     "coarse": Rule(
@@ -105,11 +105,11 @@ RULES: Mapping[str, Rule] = {
         {"verdict.misfit.as_refitted": _ours, "verdict.confirm.as_refitted": _ours},
     ),
     "confirmed": Rule(
-        "a name has to predict parts that it was not fitted to", {"diagnosis.confirmed": _keeps}
+        "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
     ),
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
-        {"diagnosis.flow_missing": lambda *a: Missing()},
+        {"diagnose.flow_missing": lambda *a: Missing()},
     ),
     "swap": Rule(
         "each effect of the best meets rivals in its place", {"search.beam.swap": _nothing}, searches=True
@@ -134,7 +134,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "laws": Rule(
-        "laws compete", {"diagnosis.with_laws": lambda case, found, limits, say: found}, searches=True
+        "laws compete", {"diagnose.with_laws": lambda case, found, limits, say: found}, searches=True
     ),
 }
 
@@ -145,7 +145,7 @@ def left_out(rule: Rule) -> Iterator[None]:
     held = []
     for name, other in rule.without.items():
         module, attribute = name.rsplit(".", 1)
-        of = importlib.import_module(f"thermoctl.diagnose.{module}")
+        of = importlib.import_module(f"thermoctl.diagnosis.{module}")
         held.append((of, attribute, getattr(of, attribute)))
         setattr(of, attribute, other)
     try:

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, cast
 
 from thermoctl import __version__
-from thermoctl.diagnose import diagnosis as engine
-from thermoctl.diagnose.data.case import Budget
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.limits import Limits, limits
-from thermoctl.diagnose.result import contract
-from thermoctl.diagnose.threads import one_thread
+from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.data.case import Budget
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import Limits, limits
+from thermoctl.diagnosis.result import contract
+from thermoctl.diagnosis.threads import one_thread
 from thermoctl.fleet.jobs import Job, Run
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings

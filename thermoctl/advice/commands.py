@@ -14,8 +14,8 @@ from rich.table import Table
 from thermoctl.advice.effect_files import check_file, files_of, own_plants
 from thermoctl.advice.plan import Planned, contract, plan
 from thermoctl.checks.commands import report
-from thermoctl.diagnose.commands import parsed_limits
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.commands import parsed_limits
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.logger import options

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl import yamlfile
-from thermoctl.diagnose.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, OWN, _read
-from thermoctl.diagnose.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, OWN, _read
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import Plant, expression, load
 from thermoctl.plant.simulate import Excitation
 from thermoctl.plant.units import check_units, dimension

@@ -1,7 +1,7 @@
 """Plan an experiment: the smallest visible size of each effect, the parameters' errors, a better course.
 
 The experiment is simulated with the plant as it is, and with its sensors' noise. The rest is linear about
-that run: visible sizes as in diagnose/report/unseen.py, and of the parameters z (0..1 in their ranges)
+that run: visible sizes as in diagnosis/report/unseen.py, and of the parameters z (0..1 in their ranges)
 
     covariance of z = (J' J + 12 I)^-1
 
@@ -20,13 +20,13 @@ import numpy as np
 from thermoctl.advice.effect_files import made_rig
 from thermoctl.checks import Finding
 from thermoctl.checks.model import plant_findings, rates_of
-from thermoctl.diagnose.data.case import Budget, case
-from thermoctl.diagnose.evidence.fit import UNIFORM, as_refitted, fitted
-from thermoctl.diagnose.experiment.design import NONE, Excitation, Lever, Limits, courses, family, levers
-from thermoctl.diagnose.hypothesis.candidates import candidates
-from thermoctl.diagnose.hypothesis.catalogue import Effect
-from thermoctl.diagnose.report.unseen import NOT_EXCITED, Visible, sized, visible
-from thermoctl.diagnose.verdict.decide import Key
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import UNIFORM, as_refitted, fitted
+from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Limits, courses, family, levers
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
+from thermoctl.diagnosis.verdict.decide import Key
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.residuals import Problem
@@ -186,7 +186,7 @@ def parameters(model: Model, tables: Sequence[Table]) -> list[Parameter]:
 def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Limits) -> Course | None:
     """Return the course of the driven inputs that gives the parameters best; None if this one does.
 
-    It is one of the next experiment's family (diagnose/experiment/design.py), as long as one recording.
+    It is one of the next experiment's family (diagnosis/experiment/design.py), as long as one recording.
     The determinant of the parameters' covariance decides, of several recordings that of an average one."""
     found = levers(plant, tables, tuple(limits), limits)
     if not found or not model.active:

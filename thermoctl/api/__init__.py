@@ -6,7 +6,6 @@ of names to arrays, or a `Table`. Errors in the input are `thermoctl.yamlfile.In
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,9 @@ from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.results import Diagnosis, Simulation, joined
 from thermoctl.checks import Finding, checks
-from thermoctl.diagnose.diagnosis import diagnose as _diagnose
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnose.limits import limits
+from thermoctl.diagnosis.diagnose import diagnose as _diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import from_plain, load
 from thermoctl.plant.initial import last_state, with_start
 from thermoctl.plant.refit import fit
@@ -149,6 +148,3 @@ __all__ = [
     "refit",
     "simulate",
 ]
-
-# The package `thermoctl.diagnose`, imported above, has taken the function's name in `thermoctl`.
-setattr(sys.modules["thermoctl"], "diagnose", diagnose)  # noqa: B010

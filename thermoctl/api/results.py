@@ -15,9 +15,9 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import over_time
-from thermoctl.diagnose.report.words import chance, words
-from thermoctl.diagnose.result import Diagnosis as Found
-from thermoctl.diagnose.result import contract
+from thermoctl.diagnosis.report.words import chance, words
+from thermoctl.diagnosis.result import Diagnosis as Found
+from thermoctl.diagnosis.result import contract
 from thermoctl.plant import save
 from thermoctl.plant.simulate import Excitation, compile_plant
 from thermoctl.plant.simulate import Simulation as Run

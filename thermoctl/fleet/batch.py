@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from thermoctl import __version__
-from thermoctl.diagnose.run import diagnose_files
+from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.extras import load
 from thermoctl.fleet.jobs import Job, Run, done
 from thermoctl.safe_file import make_folder, write_text

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from thermoctl.diagnose.hypothesis.catalogue import CATALOGUE
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE
 from thermoctl.shipped import shipped
 
 _SOURCE = (".py", ".pyx", ".pxd", ".h")  # suffixes of code
@@ -56,7 +56,7 @@ def program() -> str:
 def program_files() -> list[Path]:
     """Find every file that can change a diagnosis: the code of four packages, the catalogue, the numbers."""
     package = Path(__file__).parents[1]
-    parts = ("checks", "diagnose", "plant", "recording")
+    parts = ("checks", "diagnosis", "plant", "recording")
     code = [f for part in parts for f in sorted((package / part).rglob("*.*")) if f.suffix in _SOURCE]
     return [*sorted(CATALOGUE.glob("*.yaml")), shipped("config") / "diagnosis.yaml", *code]
 

@@ -1,1 +1,0 @@
-"""What the tried hypotheses say: physics or misfit, confirmed or not, and the verdict."""

@@ -1,0 +1,262 @@
+"""The command `diagnose`, and `effects save`.
+
+Progress while they work, a summary for a person, JSON for a program."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from thermoctl.checks.commands import checked, report
+from thermoctl.diagnosis import run
+from thermoctl.diagnosis.experiment.file import peaks
+from thermoctl.diagnosis.experiment.resolve import resolve
+from thermoctl.diagnosis.law.result import save_effect
+from thermoctl.diagnosis.report.words import sentences, what_next
+from thermoctl.diagnosis.show import read
+from thermoctl.diagnosis.workers import cluster
+from thermoctl.plant import load
+from thermoctl.plant.language import Plant
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.recording.table import Table as Recording
+from thermoctl.yamlfile import InputError
+
+QUIET_S = 5.0  # seconds between two lines on the same stage
+
+
+class StageReporter:
+    """Writes each stage with the time gone; inside a stage at most one line in QUIET_S.
+
+    As a context, it writes a line every QUIET_S while nothing is reported: a sign of life."""
+
+    def __init__(self) -> None:
+        self.started, self.stage, self.last, self.written = time.monotonic(), "", "", 0.0
+        self.ended = threading.Event()
+        self.beat = threading.Thread(target=self._live, daemon=True)
+
+    def __call__(self, text: str) -> None:
+        gone, stage = time.monotonic() - self.started, text.partition(":")[0]
+        self.last = text
+        if stage != self.stage or gone - self.written >= QUIET_S:
+            self.stage, self.written = stage, gone
+            print(f"{gone:6.1f} s: {text}", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> StageReporter:
+        self.beat.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ended.set()
+
+    def _live(self) -> None:
+        while not self.ended.wait(1.0):
+            if self.last and time.monotonic() - self.started - self.written >= QUIET_S:
+                self(self.last)
+
+
+@contextlib.contextmanager
+def on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Yield whether Ctrl-C was pressed; the second one raises KeyboardInterrupt, as usual.
+
+    A process in the background that ignores Ctrl-C goes on doing so."""
+    asked = threading.Event()
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored or threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+
+    def ask(*_: object) -> None:
+        """Let the search end after the present refit; the next Ctrl-C ends the program."""
+        asked.set()
+        signal.signal(signal.SIGINT, before)
+        print(
+            "thermoctl: the search ends after this refit, with the result so far; Ctrl-C again gives up",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def diagnose(args: argparse.Namespace) -> int:
+    """`thermoctl diagnose`: run the diagnosis and print its summary.
+
+    Raises InputError for unusable inputs."""
+    if not args.recordings:
+        raise InputError("no recording was given; one or more were expected, or --live")
+
+    run.writable(Path(args.out))
+    plant = load(args.plant, args.map)
+    given, found_before = checked(plant, args.recordings, args)
+    held_out, found_held = checked(plant, args.held_out or (), args)
+    report(list(dict.fromkeys([*found_before, *found_held])), sys.stderr)
+    if any(f.severe for f in (*found_before, *found_held)) and not args.anyway:
+        raise InputError(
+            f"{args.plant}: not diagnosed: the checks above would make any name doubtful; correct the data or the "
+            "plant, or diagnose with --anyway"
+        )
+
+    def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        """Diagnose the recordings given, and those that the experiments added."""
+        added = read_recordings(
+            plant, recordings[len(args.recordings) :]
+        )  # of --resolve: written by thermoctl
+        return _run(args, plant, [*given, *added], held_out)
+
+    try:
+        found = _resolved(args, diagnosed) if args.resolve else diagnosed(args.recordings)
+    except KeyboardInterrupt:
+        print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
+        raise
+    if args.json:
+        print(json.dumps(found, indent=1, allow_nan=False))
+    elif not args.quiet:
+        summary(found, args.out)
+    return 0
+
+
+def _run(
+    args: argparse.Namespace, plant: Plant, tables: Sequence[Recording], held_out: Sequence[Recording]
+) -> dict[str, Any]:
+    """Diagnose with progress, Ctrl-C and the options of the command line."""
+    with (
+        contextlib.nullcontext() if args.quiet else StageReporter() as progress,
+        on_interrupt() as stopped,
+        cluster(args.scheduler),
+    ):
+        return run.diagnose(
+            plant,
+            tables,
+            args.out,
+            [Path(e) for e in args.effects or ()],
+            held_out,
+            progress,
+            args.drive or (),
+            parsed_limits(args.limit or ()),
+            stopped,
+            Path(args.continued) if args.continued else None,
+        )
+
+
+def _resolved(
+    args: argparse.Namespace, diagnosed: Callable[[Sequence[str]], dict[str, Any]]
+) -> dict[str, Any]:
+    """Diagnose, record what is proposed, and diagnose again (`--resolve`)."""
+    say = functools.partial(print, file=sys.stderr, flush=True)
+    return resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
+
+
+def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """NAME=LOW:HIGH of each. Raises InputError."""
+    out = {}
+    for text in told:
+        name, _, span = text.partition("=")
+        low, _, high = span.partition(":")
+        try:
+            out[name] = (float(low), float(high))
+        except ValueError:
+            raise InputError(
+                f"--limit {text}: NAME=LOW:HIGH was expected, such as block_temperature=15:90"
+            ) from None
+        if not out[name][0] < out[name][1]:
+            raise InputError(f"--limit {text}: the first number must be the smaller one")
+    return out
+
+
+def save_law(args: argparse.Namespace) -> int:
+    """`thermoctl effects save DIR NAME`: save the law of a diagnosis as an effect file. Raises InputError."""
+    if len(args.files) != 2:
+        raise InputError(
+            "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
+        )
+    folder, label = args.files
+    path = save_effect(read(Path(folder)), label, Path((args.effects or ["effects"])[0]))
+    print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
+    return 0
+
+
+def summary(found: dict[str, Any], out: str | Path) -> None:
+    """Print a result for a person."""
+    console = Console() if sys.stdout.isatty() else Console(width=160)
+    console.print(f"[bold]{found['verdict'].replace('_', ' ')}[/]. {' '.join(sentences(found))}")
+    if found["findings"]:
+        console.print(_findings(found["findings"]))
+    if found["alternatives"]:
+        table = _table("alternative", "where", "probability")
+        for a in found["alternatives"][:8]:
+            table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
+        console.print(table)
+    console.print(_errors(found))
+    lines = [f"note: {note}" for note in found["notes"]]
+    if found["next_experiment"]:
+        lines += _next_experiment(found["next_experiment"], Path(out))
+    lines += [
+        f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}"
+        for k, r in enumerate(found.get("resolved", ()), 1)
+    ]
+    lines.append(f"what next: {what_next(found)}")
+    lines.append(
+        f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json ({found['seconds']:.0f} s)"
+    )
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def _table(*titles: str) -> Table:
+    return Table(*titles, box=None, header_style="bold")
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> Table:
+    table = _table("effect", "where", "equation", "parameter", "value", "95 %")
+    for f in findings:
+        first = [f["effect"], f["where"], f["equation"]]
+        for name, p in f["parameters"].items():
+            value = f"{p['value']:.4g} {p['unit'] or ''}"
+            table.add_row(*first, name, value, f"± {1.96 * (p['sd'] or 0):.2g}")
+            first = ["", "", ""]
+    return table
+
+
+def _errors(found: Mapping[str, Any]) -> Table:
+    columns = {
+        "before": "as it came",
+        "refit_only": "refitted",
+        "after": "with the findings",
+        "held_out_refit_only": "held out: refitted",
+        "held_out_after": "held out: with the findings",
+    }
+    if not found["findings"] and not (found["remainder"] or {}).get("law"):
+        columns = {k: title for k, title in columns.items() if not k.endswith("after")}
+    table = _table("rms of", "noise", *columns.values())
+    for o, x in found["outputs"].items():
+        table.add_row(o, _number(x["noise"]), *(_number(found["fit"][k].get(o)) for k in columns))
+    return table
+
+
+def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
+    return [
+        f"next experiment: {entry['profile']}. {entry['why']} {entry['also_helpful'] or ''}",
+        *(f"    {line}" for line in peaks(entry)),
+        f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
+        "or let `thermoctl diagnose --resolve` do it",
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

@@ -1,0 +1,302 @@
+"""The recordings that take part in the choice, and the plant as it came."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from thermoctl.checks.model import SIGMAS, start_errors
+from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
+from thermoctl.diagnosis.data.grids import Grid, grid
+from thermoctl.diagnosis.data.memory import NOTHING, Memory
+from thermoctl.diagnosis.data.progress import Pace
+from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import give_back
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit, fit
+from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
+from thermoctl.plant.whitening import Noise
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+LEAST = 40  # measured values of one output, below which nothing is decided
+STATED = 12  # the same where the plant file states the noise, which then is not estimated from them
+ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
+LARGEST = 1e-5
+FAST = 0.01  # share of an output's changes that may be jumps
+LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and shared rigs
+
+
+@dataclass
+class Budget:
+    """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
+
+    - `planned`: number of refits after this step of the search; each step may plan more
+    - `later`: number of hypotheses that the search may extend besides; only the time left depends on it
+    - `stopped`: does a person want the result of what is done so far?
+    - `untried`: refits of promising hypotheses left out"""
+
+    fits: int
+    progress: Callable[[str], None] = lambda text: None
+    stopped: Callable[[], bool] = lambda: False
+    fits_done: int = 0
+    planned: int = 1
+    untried: int = 0
+    later: float = 0.0
+    pace: Pace = field(default_factory=Pace)
+    lock: Lock = field(default_factory=Lock)  # two refits may run side by side
+
+    @property
+    def spent(self) -> bool:
+        """Is there nothing left for another refit?"""
+        return self.fits_done >= self.fits or self.stopped()
+
+    def spend(self) -> None:
+        """Count one refit, and report it."""
+        give_back()
+        with self.lock:
+            self.pace.enter("refit")
+            self.fits_done += 1
+            planned = min(max(self.planned, self.fits_done), self.fits)
+            left = self._left(planned - self.fits_done + 1, 0)
+            self.progress(
+                f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits}){left}"
+            )
+
+    def screen(self) -> None:
+        """Report that a hypothesis is screened for effects."""
+        give_back()
+        self.pace.enter("screening")
+        number = 1 + len(self.pace.spent.get("screening", ()))
+        self.progress(
+            f"searching: screening {number}, after refit {self.fits_done}{self._left(min(LATER, self.later), 1)}"
+        )
+
+    def _left(self, refits: float, screenings: float) -> str:
+        planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
+        return self.pace.told({"refit": planned, "screening": screenings + self.later})
+
+
+@dataclass(frozen=True)
+class Case:
+    """Data, catalogue and budget of a diagnosis.
+
+    All hypotheses are scored in the same `coordinates` and `grids`. `off`: first samples less the plant's
+    start, of the outputs that contradict it. `rtol`: local error of every simulation."""
+
+    plant: Plant
+    tables: tuple[Table, ...]
+    catalogue: Mapping[str, Effect]
+    noise: tuple[Noise, ...]
+    null: Fit
+    coordinates: Coordinates
+    grids: tuple[Grid, ...]
+    budget: Budget
+    notes: list[str] = field(default_factory=list)
+    block: int = 1  # rows of the recordings whose mean is one row here
+    off: Mapping[str, float] = field(default_factory=dict)
+    rtol: float = RTOL
+    memory: Memory = NOTHING  # of earlier recordings
+
+    def drives(self, model: Model) -> list[Excitation]:
+        """The recordings as a model reads them. Models that read the same columns share their values."""
+        if _readings(model) == _readings(self.null.model):
+            return [dataclasses.replace(d) for d in self._read]
+        return self._excitations(model)
+
+    @cached_property
+    def _read(self) -> list[Excitation]:
+        return self._excitations(self.null.model)
+
+    def _excitations(self, model: Model) -> list[Excitation]:
+        return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
+
+
+def _readings(model: Model) -> list[Any]:
+    """Return all that decides how a model reads a recording; a delayed input has a column of its own."""
+    plant = model.plant
+    outputs = [(o.name, o.column, o.unit, o.conversion) for o in plant.outputs.values()]
+    return [*plant.inputs.values(), *model.code.inputs, *outputs]
+
+
+def case(
+    plant: Plant,
+    tables: Sequence[Table],
+    catalogue: Mapping[str, Effect],
+    budget: Budget,
+    memory: Memory = NOTHING,
+) -> Case:
+    """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
+
+    Rows of long recordings are put together (rows.py).
+    Raises InputError where too few values were measured."""
+    plant, off, freed = _free_starts(plant, tables)
+    fewer = reduced(plant, tables)
+    tables = fewer.tables
+    model = compile_plant(plant)
+    drives = [model.excitation(t) for t in tables]
+    _enough(model, drives, ", ".join(t.path for t in tables))
+    noise = fewer.noise(plant, drives)
+    rtol = _rtol(drives, noise)
+    for d in drives:
+        d.rtol = rtol
+    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
+    as_stated = [
+        d.y - model.run(d, values, np.zeros_like(dx0)).y
+        for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)
+    ]
+    tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
+    drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
+    coordinates = Coordinates(drives)
+    rig = Structure(plant, drives, [t.columns for t in tables])
+    return Case(
+        plant,
+        tuple(tables),
+        catalogue,
+        noise,
+        null,
+        coordinates,
+        _grids(coordinates, drives, null, fewer),
+        budget,
+        [
+            *freed,
+            *([fewer.note] if fewer.block > 1 else []),
+            *([f"{dropped} single outliers were left out"] if dropped else []),
+            *rig.guesses(),
+        ],
+        fewer.block,
+        off,
+        rtol,
+        memory,
+    )
+
+
+def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
+    """Raise InputError where no output has enough measured values, in recordings with FEWEST or more."""
+    outputs = list(model.plant.outputs.values())
+    measured = np.array([np.isfinite(d.y).sum(axis=0) for d in drives])
+    counts = np.where(measured >= FEWEST, measured, 0).sum(axis=0)
+    stated = [bool(o.noise_sd or o.resolution) for o in outputs]
+    over = counts.sum() >= 2 * (len(model.active) + len(drives) * len(model.uncertain))
+    if any(n >= (STATED if known and over else LEAST) for n, known in zip(counts, stated, strict=True)):
+        return
+    raise InputError(
+        f"{paths}: too little data: at most {max(counts, default=0)} measured values of one output "
+        f"({', '.join(o.column for o in outputs)}) in recordings of {FEWEST} or more; {LEAST} are needed, or {STATED} where "
+        "the plant file states the output's noise and all outputs have twice as many values as there are unknowns"
+    )
+
+
+def with_tables(case: Case, tables: Sequence[Table]) -> Case:
+    """Return the case with parts of its recordings, the plant refitted to them; noise and accuracy stay.
+
+    Rows that are means already stay as they are."""
+    model = compile_plant(case.plant)
+    drives = [dataclasses.replace(model.excitation(t), rtol=case.rtol) for t in tables]
+    null = fit(model, drives, case.noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
+    coordinates = Coordinates(drives)
+    grids = _grids(coordinates, drives, null, Reduced(list(tables), case.block, 0, 0))
+    return dataclasses.replace(
+        case, tables=tuple(tables), null=null, coordinates=coordinates, grids=grids, block=1
+    )
+
+
+def _grids(
+    coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, rows: Reduced
+) -> tuple[Grid, ...]:
+    """Return the frequencies of each measured output."""
+    sensors = [rows.sensor(o.noise) for o in null.model.plant.outputs.values()]
+    change = _changes(null, drives, rows.block)
+    return tuple(
+        grid(coordinates, ks, null.noise[j].sigma, _swing(drives, j), change[j], sensors[j], rows.block)
+        for j, ks in coordinates.by_output().items()
+    )
+
+
+def _changes(null: Fit, drives: Sequence[Excitation], block: int) -> np.ndarray:
+    """Return the rms change of each output in a sampling interval, over the root of `block`.
+
+    The fastest hundredth is left out: there an input that is held jumps, at a time that is known."""
+    squares = []
+    for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True):
+        slope = np.abs(np.gradient(null.model.run(d, values, dx0).y, d.t, axis=0))
+        calm = np.where(slope <= np.quantile(slope, 1 - FAST, axis=0), slope, np.nan)
+        squares.append(np.nanmean((calm * np.median(np.diff(d.t)) / block) ** 2, axis=0))
+    return np.asarray(np.sqrt(np.mean(squares, axis=0) / block))
+
+
+def _rtol(drives: Sequence[Excitation], noise: Sequence[Noise]) -> float:
+    """Return the local error whose sum stays far below the sensors' noise.
+
+    With ACCURATE times noise over range it was 0.001 to 0.02 of the noise on six real rigs."""
+    values = np.concatenate([d.y for d in drives])
+    seen = np.isfinite(values).any(axis=0)
+    span = np.nanmax(values[:, seen], axis=0) - np.nanmin(values[:, seen], axis=0)
+    sigma = np.array([n.sigma for n in noise])[seen]
+    return float(np.clip(ACCURATE * np.min(sigma / np.maximum(span, 1e-300)), RTOL, LARGEST))
+
+
+def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str, float], list[str]]:
+    """Return the plant with free starts of bodies that first samples contradict, `Case.off`, and notes.
+
+    Such a start is not known. A refit that is bound to it would take the way back from it for physics."""
+    model, nodes, notes = compile_plant(plant), dict(plant.nodes), []
+    off: dict[str, float] = {}
+    for table in tables:
+        for output, (error, sigmas) in start_errors(model, model.excitation(table)).items():
+            if sigmas <= SIGMAS:
+                continue
+            off[output] = max(error, off.get(output, 0.0), key=abs)
+            for n in sorted(ex.names(plant.outputs[output].value) & nodes.keys()):
+                sigma = max(abs(error), nodes[n].initial_sigma or 0.0)
+                nodes[n] = dataclasses.replace(nodes[n], initial_sigma=sigma)
+                notes.append(
+                    f"'{output}' starts {error:+.3g} from the plant's start: the start of '{n}' was fitted"
+                )
+    return dataclasses.replace(plant, nodes=nodes), off, list(dict.fromkeys(notes))
+
+
+def _swing(drives: Sequence[Excitation], j: int) -> float:
+    """Root mean square of an output about its mean, over all recordings."""
+    values = np.concatenate([d.y[:, j] for d in drives])
+    return float(np.nanstd(values))
+
+
+def _without_outliers(
+    tables: Sequence[Table],
+    plant: Plant,
+    residuals: Sequence[np.ndarray],
+    as_stated: Sequence[np.ndarray],
+    noise: Sequence[Noise],
+) -> tuple[list[Table], int]:
+    """The recordings without cells whose residual lies far from its neighbours', and how many those are.
+
+    `as_stated`: residuals with the stated starts. The first readings, up to which these predict all, are no
+    outliers: a refit that moved a start may have left them far behind."""
+    out, dropped = [], 0
+    for t, e, stated in zip(tables, residuals, as_stated, strict=True):
+        columns = dict(t.columns)
+        for j, o in enumerate(plant.outputs.values()):
+            index = np.flatnonzero(np.isfinite(e[:, j]))
+            if len(index) < LEAST:
+                continue
+            away = e[index, j] - median_filter(e[index, j], 5)
+            limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
+            predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
+            odd = index[(np.abs(away) > limit) & ~predicted]
+            if len(odd) and len(odd) < 0.02 * len(index):
+                columns[o.column] = columns[o.column].copy()
+                columns[o.column][odd] = np.nan
+                dropped += len(odd)
+        out.append(dataclasses.replace(t, columns=columns))
+    return out, dropped

@@ -1,0 +1,139 @@
+"""The frequency grid of an output, and the priors of noise and remainder there (equations in noise.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermoctl.diagnosis.data.coordinates import WIDTH, Coordinates
+from thermoctl.diagnosis.data.spectra import STARTS, slow_parts, spectrum
+from thermoctl.plant.language import SensorNoise
+
+STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off by more than 1.6 times
+# The error of recorded times in sampling intervals: median, and prior sd of log j^2 (a factor of ten in j).
+# A clock in hardware has 1e-4 or less, a program that polls a device on a busy machine 1e-1.
+CLOCK, CLOCK_SD = 3e-3, 2 * np.log(10.0)
+# Of the noise's variance, from which an error of the times, two sd above the median, is looked for
+SEEN = 0.1
+SMALL = 0.02  # of an output's swing: width of the prior of the remainder's rms
+# Prior sd of u (noise.py) at the lowest frequency: one sd is a factor of ten in the remainder's rms.
+LEVEL = 2 * np.log(10.0)
+DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
+WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The frequency grid of one output, common to its recordings, and the prior of its remainder there.
+
+    `node`: for each band of all recordings, the index of the band's frequency in the grid. `count`: number of
+    DCT rows at each frequency."""
+
+    channels: tuple[int, ...]  # positions in Coordinates.channels
+    node: np.ndarray
+    count: np.ndarray
+    block: int  # samples whose mean is one row of the recordings
+    turn: np.ndarray  # angle in a sampling interval
+    shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
+    slow: np.ndarray  # (starts, nodes) the same of noise with slow parts
+    known: float  # prior sd of log c^2
+    rough: np.ndarray  # (nodes, nodes) inverse covariance of u
+    log_rough: float  # its log determinant
+    log_small: float  # log of the half-normal's mean over the random walk
+    sigma: float  # s of noise.py: standard deviation of the stated noise, in the output's unit
+    change: float  # w of noise.py: the output's change in a sampling interval, in its unit
+    swing: float  # rms of the output about its mean
+    sensor: SensorNoise | None  # the parts of the stated noise
+
+    def power(self, powers: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the power at each frequency (nodes,) from the bands' of all channels of all outputs."""
+        return np.bincount(self.node, np.concatenate([powers[k] for k in self.channels]))
+
+    @property
+    def variance(self) -> float:
+        """Variance of the stated noise, s^2."""
+        return self.sigma**2
+
+    @cached_property
+    def clock(self) -> float:
+        """Variance by the times' median error, over the stated noise's; 0 where it would not be seen."""
+        ratio = (CLOCK * self.change / self.sigma) ** 2
+        return ratio if ratio * np.exp(2 * CLOCK_SD) > SEEN else 0.0
+
+    @cached_property
+    def scales(self) -> np.ndarray:
+        """Prior sd of log c^2 and, where it is looked for, of log j^2."""
+        return np.array([self.known, CLOCK_SD] if self.clock else [self.known])
+
+    @property
+    def timing(self) -> float:
+        """Variance by an error of the times that is one prior sd above the median."""
+        return float(self.variance * self.clock * np.exp(CLOCK_SD))
+
+    @property
+    def most(self) -> float:
+        """Variance of the noise, its parts one prior sd above their medians."""
+        return self.variance * float(np.exp(self.known)) + self.timing
+
+    @property
+    def small(self) -> float:
+        """Square of the prior width of the remainder's rms, q."""
+        return (SMALL * self.swing) ** 2
+
+
+def grid(
+    coordinates: Coordinates,
+    positions: Sequence[int],
+    sigma: float,
+    swing: float,
+    change: float = 0.0,
+    sensor: SensorNoise | None = None,
+    block: int = 1,
+) -> Grid:
+    """Return the frequencies of one output.
+
+    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean. `change`: its
+    rms change in a sampling interval, over the root of `block`. `sensor`: the parts of the noise, where the
+    plant file states them. `block`: samples whose mean is one row. A mean of samples has the spectrum of the
+    samples, divided by their number: slow parts keep their size and time."""
+    channels = [coordinates.channels[k] for k in positions]
+    octave = np.concatenate([np.log2(c.frequency) for c in channels])
+    cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
+    known, node = np.unique(cells, return_inverse=True)
+    count = np.bincount(node, np.concatenate([c.count for c in channels]).astype(float))
+    apart = np.diff(known) * np.log2(WIDTH)
+    rough = np.zeros((len(known), len(known)))
+    rough[0, 0] = LEVEL**-2
+    for k, octaves in enumerate(apart):
+        rough[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / (WALK**2 * octaves)
+    walks = np.linalg.solve(
+        np.linalg.cholesky(rough).T, np.random.default_rng(3).standard_normal((len(known), DRAWS))
+    )
+    log_small = float(logsumexp(-0.5 * count @ np.exp(walks) / count.sum()) - np.log(DRAWS))
+    log_rough = float(np.linalg.slogdet(rough)[1])
+    frequency = np.exp2(octave.min()) * WIDTH**known
+    interval = channels[0].interval
+    turn = 2 * np.pi * frequency * interval / block
+    shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
+    slow = np.array([slow_parts(turn, x) for x in STARTS])
+    return Grid(
+        tuple(positions),
+        node,
+        count,
+        block,
+        turn,
+        shape * count.sum() / (shape @ count),
+        slow * count.sum() / (slow @ count)[:, None],
+        2 * sensor.sd if sensor and sensor.sd else STATED,
+        rough,
+        log_rough,
+        log_small,
+        sigma,
+        change,
+        swing,
+        sensor,
+    )

@@ -1,0 +1,146 @@
+"""Learn each sensor's own noise from recordings in which nothing else is expected: `thermoctl noise`.
+
+The plant is refitted to the recordings, and the residual of each output is taken for its noise. Three spectra
+are compared: white, white with a first-order part, and white with a 1/f part. In a band of a DCT
+(coordinates.py) with n rows and power P the likelihood is the Gaussian one:
+
+    log p = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
+
+Each further number costs log(rows) / 2 (Schwarz 1978). Physics that the plant lacks would be learnt as noise,
+too: so the recordings should be quiet, or the plant complete.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table as Printed
+from scipy.optimize import minimize
+
+from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
+from thermoctl.diagnosis.data.spectra import spectrum
+from thermoctl.plant import load, save
+from thermoctl.plant.language import Plant, SensorNoise
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.plant.refit import fit
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.whitening import default_noise
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+LEAST = 100  # measured values of an output from which its noise is learnt
+DIGITS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class _Powers:
+    """Rows and power in each band of a channel."""
+
+    channel: Channel
+    power: np.ndarray
+
+
+def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
+    """Return the plant with the noise of every output that was measured often enough. Raises InputError."""
+    model = compile_plant(plant)
+    drives = [model.excitation(t) for t in tables]
+    coordinates = Coordinates(drives)
+    counts = {
+        j: sum(len(coordinates.channels[k].index) for k in ks) for j, ks in coordinates.by_output().items()
+    }
+    if max(counts.values(), default=0) < LEAST:
+        raise InputError(
+            f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts.values(), default=0)} measured "
+            f"values of one output; {LEAST} or more are needed to learn its noise"
+        )
+    found = fit(model, drives, default_noise(plant, drives), iterations=40, tolerance=1e-3, seconds=np.inf)
+    outputs = dict(plant.outputs)
+    for j, ks in coordinates.by_output().items():
+        if counts[j] < LEAST:
+            continue
+        channels = [coordinates.channels[k] for k in ks]
+        rows = [transform(c, found.residuals[c.recording][:, j]) for c in channels]
+        powers = [_Powers(c, np.bincount(c.band, x * x)) for c, x in zip(channels, rows, strict=True)]
+        o = outputs[model.outputs[j]]
+        step = (o.resolution or 0.0) ** 2 / 12  # the rounding's own variance is stated apart
+        outputs[o.name] = dataclasses.replace(o, noise=_best(powers, step))
+    return dataclasses.replace(plant, outputs=outputs)
+
+
+def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
+    """Return the likeliest of the three spectra, less what each further number costs."""
+    rows = sum(float(p.channel.count.sum()) for p in powers)
+    total = float(np.sqrt(sum(p.power.sum() for p in powers) / rows))
+    longest = max(p.channel.interval * p.channel.rows for p in powers)
+    shortest = min(p.channel.interval for p in powers)
+    starts = {
+        "white": [[0.0]],
+        "drift": [[-0.3, -1.0, np.log(tau)] for tau in np.geomspace(3 * shortest, longest / 3, 4)],
+        "flicker": [[-0.3, -1.5]],
+    }
+    tried = []
+    for kind, points in starts.items():
+        for start in points:
+            done = minimize(_cost, start, (kind, powers, total, step), method="Nelder-Mead")
+            noise = _made(kind, done.x, total)
+            inside = noise.time is None or shortest < noise.time < longest
+            tried.append((done.fun + 0.5 * len(start) * np.log(rows) + (0 if inside else np.inf), noise))
+    best = min(tried, key=lambda x: x[0])[1]
+    scale = [_scale(p, best, step) for p in powers]
+    spread = float(np.var(np.log(scale)) if len(scale) > 1 else 0.0)
+    sd = np.sqrt(0.5 / rows + spread)  # of the logarithm: of one estimate, and from recording to recording
+    return dataclasses.replace(best, sd=float(f"{sd:.{DIGITS}g}"))
+
+
+def _made(kind: str, x: np.ndarray, total: float) -> SensorNoise:
+    size = [float(f"{total * np.exp(v):.{DIGITS}g}") for v in x[:2]]
+    if kind == "drift":
+        return SensorNoise(size[0], drift=size[1], time=float(f"{np.exp(x[2]):.{DIGITS}g}"))
+    return SensorNoise(size[0], flicker=size[1]) if kind == "flicker" else SensorNoise(size[0])
+
+
+def _cost(x: np.ndarray, kind: str, powers: Sequence[_Powers], total: float, step: float) -> float:
+    """Minus the log likelihood, up to a constant."""
+    noise, cost = _made(kind, np.clip(x, -20.0, 20.0), total), 0.0
+    for p in powers:
+        v = step + spectrum(noise, p.channel.frequency, p.channel.interval) + 1e-12 * total**2
+        cost += 0.5 * float(np.sum(p.channel.count * np.log(v) + p.power / v))
+    return cost
+
+
+def _scale(p: _Powers, noise: SensorNoise, step: float) -> float:
+    """Return a channel's rms in units of a noise."""
+    v = step + spectrum(noise, p.channel.frequency, p.channel.interval)
+    return float(np.sqrt(np.sum(p.power / v) / p.channel.count.sum()))
+
+
+def command(args: argparse.Namespace) -> int:
+    """`thermoctl noise`: learn, write the plant file, print stated and learnt noise. Raises InputError."""
+    plant = load(args.plant)
+    if Path(args.out).resolve() == Path(args.plant).resolve():
+        raise InputError(f"--out {args.out}: is the plant file itself; name another file")
+    found = learnt(plant, read_recordings(plant, args.recordings))
+    save(found, args.out, note=f"{Path(args.plant).name}, with its sensors' noise learnt")
+    load(args.out)
+    table = Printed("output", "unit", "stated", "learnt", "known to", box=None, header_style="bold")
+    for name, o in found.outputs.items():
+        before = plant.outputs[name].noise
+        sd = o.noise.sd if isinstance(o.noise, SensorNoise) and o.noise.sd else None
+        table.add_row(
+            name,
+            o.unit or "",
+            "-" if before is None else str(before),
+            str(o.noise) if o is not plant.outputs[name] else "too few values",
+            f"{100 * sd:.2g} %" if sd else "-",
+        )
+    console = Console(width=160)
+    console.print(table)
+    console.print(
+        f"written: {args.out}. What the plant lacks in these recordings is counted as noise.", markup=False
+    )
+    return 0

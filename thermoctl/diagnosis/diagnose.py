@@ -1,0 +1,176 @@
+"""The whole diagnosis in five sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.data.memory import NOTHING, Memory
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
+from thermoctl.diagnosis.evidence.held_out import split, worth
+from thermoctl.diagnosis.evidence.levels import remainder
+from thermoctl.diagnosis.evidence.unknown import left, reached
+from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.catalogue import Effect, contained
+from thermoctl.diagnosis.law.contest import with_laws
+from thermoctl.diagnosis.law.find import Law, found_law
+from thermoctl.diagnosis.law.forms import LAW
+from thermoctl.diagnosis.law.smooth import missing_flow
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.result import Diagnosis
+from thermoctl.diagnosis.search.beam import Keys, Searched, Weighed, search
+from thermoctl.diagnosis.threads import one_thread
+from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
+from thermoctl.diagnosis.verdict.decide import Decision, Facts, Posterior, decide, weigh
+from thermoctl.diagnosis.verdict.misfit import energies, standing, supported
+from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
+from thermoctl.plant.language import Plant
+from thermoctl.recording.table import Table
+
+
+@dataclass(frozen=True)
+class Sought:
+    """All hypotheses that were tried, before a decision.
+
+    `reserve`: recordings that take no part in any choice. `unsure`: an untried hypothesis may be likelier, so
+    that nothing is named."""
+
+    case: Case
+    searched: Searched
+    limits: Limits
+    reserve: tuple[Table, ...]
+    unsure: bool
+
+
+@one_thread()
+def diagnose(
+    plant: Plant,
+    tables: Sequence[Table],
+    entries: Mapping[str, Effect],
+    numbers: Limits,
+    held_out: Sequence[Table] = (),
+    progress: Callable[[str], None] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    memory: Memory = NOTHING,
+) -> Diagnosis:
+    """Find the physics that a plant lacks, from recordings. Raises InputError.
+
+    `held_out`: recordings that take no part in any choice. `progress` is called with each stage and refit.
+    Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
+    of earlier recordings."""
+    say = progress or (lambda text: None)
+    found = sought(plant, tables, entries, numbers, held_out, say, stopped, memory)
+    say("measuring what the findings are worth")
+    return decided(found)
+
+
+def sought(
+    plant: Plant,
+    tables: Sequence[Table],
+    entries: Mapping[str, Effect],
+    numbers: Limits,
+    held_out: Sequence[Table] = (),
+    say: Callable[[str], None] = lambda text: None,
+    stopped: Callable[[], bool] = lambda: False,
+    memory: Memory = NOTHING,
+) -> Sought:
+    """Try the hypotheses; arguments as of `diagnose`. Raises InputError."""
+    say("refitting the plant's own parameters")
+    chosen_on, reserve = split(tables, held_out)
+    known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
+    searched = with_laws(known, search(known, numbers), numbers, say)
+    return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
+
+
+def decided(sought: Sought) -> Diagnosis:
+    """Return what a search says: posterior, findings and their worth, remainder, verdict, missing flow."""
+    found = _decided(sought)
+    if found.decision.verdict != "consistent" and not found.shown and found.before.node:
+        found = replace(found, missing_flow=missing_flow(sought.case, found.null, found.before.node))
+    return found
+
+
+def _decided(sought: Sought) -> Diagnosis:
+    known, searched, numbers, reserve = sought.case, sought.searched, sought.limits, sought.reserve
+    energy = energies(known, searched, numbers)
+    dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
+    physics = standing(energy, dims, contained(known.catalogue), numbers)
+    tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
+    fits = {keys: w.fitted for keys, w in tried.items()}
+    posterior = weigh({keys: tried[keys].score for keys in physics}, physics, numbers)
+    best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
+    asked: dict[Key, float] = {}
+    if posterior.something >= numbers.name:
+        likeliest = next(keys for keys in posterior.hypotheses if keys)
+        stand = supported(likeliest, physics)  # the other effects are part of the remainder
+        found = stand if stand in fits else likeliest
+        kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
+        best = with_residuals(known, fits[kept]) if kept else null
+    reach = reached(known)
+    after, before = left(known, best, reach), left(known, null, reach)
+    value = worth(known, null, best, reserve)
+    keys = () if sought.unsure else (e.key for e in best.hypothesis.effects)
+    named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
+    # data that took part in the choice cannot speak against it
+    told = bool(best.hypothesis.effects) and value.reserved
+    ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
+    remains = remainder(known, fits[best.hypothesis.keys])
+    unknown = Missing()
+    if remains < numbers.name:
+        unknown = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
+    if unknown.probability >= numbers.name:
+        after = replace(after, node=unknown.node or after.node)
+        before = before if best.hypothesis.effects else after
+    facts = Facts(
+        posterior.something,
+        posterior.something if best.hypothesis.effects or not asked else 0.0,
+        named,
+        max(after.over_noise.values()),
+        ratio,
+        remains,
+        worse,
+        unknown.probability,
+    )
+    decision = decide(posterior, facts, numbers)
+    doubt = unknown.told(decision.verdict, numbers)
+    return Diagnosis(
+        known,
+        searched,
+        posterior,
+        best,
+        null,
+        after,
+        before,
+        value,
+        decision,
+        energy,
+        physics,
+        doubt,
+        asked,
+        law=_law(known, tried, best, decision, posterior, asked),
+    )
+
+
+def _law(
+    known: Case,
+    tried: Mapping[Keys, Weighed],
+    best: Fitted,
+    decision: Decision,
+    posterior: Posterior,
+    asked: Mapping[Key, float],
+) -> Law | None:
+    """Return the law among the names, with its gain over the best hypothesis without it."""
+    key = next((key for key in decision.named if key[0] == LAW), None)
+    if key is None:
+        return None
+    mine = best.hypothesis.keys
+    without = max((w for keys, w in tried.items() if keys < mine and key not in keys), key=lambda w: w.score)
+    gain = tried[mine].score - without.score
+    return found_law(known, best, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))
+
+
+def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:
+    """Return the root of the outputs' mean ratio of mean squares; infinite if a simulation failed."""
+    pairs = [(after.get(o, float("inf")), before[o]) for o in before if before[o] > 0]
+    return (sum((a / b) ** 2 for a, b in pairs) / max(len(pairs), 1)) ** 0.5

@@ -1,0 +1,1 @@
+"""Hypotheses refitted: likelihood with noise and remainder, prior odds, log evidence."""

@@ -1,0 +1,58 @@
+"""The curvature of a log posterior at its maximum, and the deviations and bounds that it tells of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thermoctl.diagnosis.evidence.posterior import Posterior
+from thermoctl.plant.residuals import Problem
+
+EDGE = 1e-6  # of a parameter's range, up to which it is at its end
+MOST = 0.9  # of a curvature that not knowing the spectrum may take
+
+
+def kept(h: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """Return the curvature of the unknowns `of` (k,), a mask; the others are eliminated."""
+    cross = h[np.ix_(~of, of)]
+    absorbed = cross.T @ np.linalg.pinv(h[np.ix_(~of, ~of)], hermitian=True) @ cross
+    return np.asarray(h[np.ix_(of, of)] - absorbed)
+
+
+def deviations(
+    posterior: Posterior, values: np.ndarray, curvature: np.ndarray, bounds: Mapping[str, str]
+) -> dict[str, float]:
+    """Return the standard deviations of the effects' parameters, in their units.
+
+    A parameter of the plant that is pressed to its bound does not give way to an effect: it is held."""
+    problem, known, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
+    moves = np.array([q not in bounds or q not in known for q, _ in problem.unknowns])
+    sd = np.zeros(len(moves))
+    inverse = np.linalg.pinv(curvature[np.ix_(moves, moves)], hermitian=True)
+    sd[moves] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        if q not in known:
+            slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
+            out[q] = max(out.get(q, 0.0), float(sd[k] * slope))
+    return out
+
+
+def at_bound(problem: Problem, z: np.ndarray) -> dict[str, str]:
+    """Return "low" or "high" for each parameter at an end of its range."""
+    return {
+        q: "low" if z[k] <= EDGE else "high"
+        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
+        if not EDGE < z[k] < 1 - EDGE
+    }
+
+
+def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
+    """matrix - relief, where no direction loses more than MOST of its curvature."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    w, q = np.linalg.eigh(matrix / np.outer(size, size))
+    root = q * np.sqrt(np.maximum(w, 1e-12))  # matrix = size root root' size
+    inner = np.linalg.solve(root, (relief / np.outer(size, size))) @ np.linalg.inv(root).T
+    share, p = np.linalg.eigh(0.5 * (inner + inner.T))
+    left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
+    return left * np.outer(size, size)

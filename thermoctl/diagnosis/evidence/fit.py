@@ -1,0 +1,396 @@
+"""A hypothesis refitted, and its log evidence by Laplace's method.
+
+    log p(D | h) ~ log p(D | z^) + log p(z^) + k/2 log 2 pi - 1/2 log |H|
+
+    H = J' E[1/V] J + prior's precision
+
+z: parameters of plant and effects, 0..1 in their ranges, and initial states in their standard deviations.
+The scale is logarithmic where a range spans a factor of three. log p(D | z) is averaged over noise and
+remainder (noise.py). Its maximum is found in posterior.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.memory import Past, PlacedBefore
+from thermoctl.diagnosis.evidence.curvature import at_bound, deviations, kept, relieved
+from thermoctl.diagnosis.evidence.noise import Averaged, averaged
+from thermoctl.diagnosis.evidence.onsets import moved
+from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
+from thermoctl.diagnosis.evidence.posterior import Placed as Placed
+from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
+from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.plant import refit
+from thermoctl.plant.climb import Climbed, bounded_step
+from thermoctl.plant.estimate import updated
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.residuals import Evaluation, Problem
+from thermoctl.plant.simulate import SimulationError
+
+SIGNIFICANT = 2.0  # standard deviations
+UNIFORM = 12.0  # precision of a uniform prior over 0..1
+PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
+DECADES = 4.0  # width of the log-uniform prior of an effect's size
+WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
+SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
+HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
+MOVES = 2  # refits after the times of jumps were moved
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A hypothesis after its refit."""
+
+    hypothesis: Hypothesis
+    plant: Plant
+    fit: Fit  # its Hessian is that of the parameters, with the starts eliminated
+    log_likelihood: float
+    log_prior: float
+    volume: float  # k/2 log 2 pi - 1/2 log |H|
+    average: Averaged
+    powers: tuple[np.ndarray, ...]
+    sd: Mapping[str, float]  # of the effects' parameters
+    rough_plant: Plant
+    rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+    rough_powers: tuple[np.ndarray, ...]
+    curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
+    past: Past  # of earlier recordings
+
+    @property
+    def absent(self) -> bool:
+        """Return whether a whole effect is not significant."""
+        return any(_insignificant(self, e, all) for e in self.hypothesis.effects)
+
+    @property
+    def doubtful(self) -> bool:
+        """Return whether a part of an effect is not significant: a simpler hypothesis may replace it."""
+        return any(
+            _insignificant(self, e, any)
+            or any(
+                p.at_zero and p.name in e.own and _near_null(self, e, p)
+                for p in e.candidate.effect.parameters
+            )
+            for e in self.hypothesis.effects
+        )
+
+    @property
+    def log_evidence(self) -> float:
+        """Log p(D | h)"""
+        return self.log_likelihood + self.log_prior + self.volume + self.past.log_evidence
+
+
+def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
+    """Return whether any, or all, amplitudes of the effect are within SIGNIFICANT sd of no effect.
+
+    For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound.
+    A period at its upper bound does not repeat in the recordings: that is no periodic effect.
+    A parameter too small to be seen, at whose zero the effect is a simpler one: it is that one."""
+    sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
+    if not set(e.own.values()) <= f.plant.parameters.keys():
+        return True  # another effect took its place
+    effect = e.candidate.effect
+    for p in effect.parameters:
+        at = f.fit.at_bound.get(e.own.get(p.name, ""))
+        if at == "high" and effect.shapes.get(p.shape or "") == "periods" or at == "low" and p.at_zero:
+            return True
+    if e.candidate.effect.prior is not None:
+        return False
+    if not sizes:
+        return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
+    return which(_near_null(f, e, p) for p in sizes)
+
+
+def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
+    """Return whether a parameter is within SIGNIFICANT sd of the value at which it changes nothing."""
+    own = e.own[p.name]
+    return abs(f.plant.parameters[own].value - p.null) < SIGNIFICANT * f.sd[own]
+
+
+def fitted(
+    case: Case,
+    plant: Plant,
+    effects: Sequence[Placed],
+    start: Fit | None = None,
+    best: Fitted | None = None,
+    parent: Fitted | None = None,
+) -> Fitted:
+    """Refit a plant that holds these effects and compute its log evidence. Raises SimulationError.
+
+    The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the hypothesis
+    before the last effect was added."""
+    case.budget.spend()
+    found = _refitted(case, plant, effects, start, best, parent)
+    for _ in range(MOVES):
+        behind = best is not None and found.log_likelihood < best.log_likelihood - HOPELESS
+        later = None if behind else moved(case, found.rough_plant, effects, found.rough)
+        again = later and _refitted(case, later, effects, None, best, parent)
+        if not again or again.log_evidence <= found.log_evidence:
+            break
+        found = again
+    return found
+
+
+def _refitted(
+    case: Case,
+    plant: Plant,
+    effects: Sequence[Placed],
+    start: Fit | None,
+    best: Fitted | None,
+    parent: Fitted | None,
+) -> Fitted:
+    """Refit a plant from one starting point; the arguments are those of `fitted`.
+
+    A refit that ends below its parent, which it contains, starts again beside the parent."""
+    posterior = Posterior(case, plant, effects)
+    if start is None:
+        start = refit.fit(
+            posterior.model,
+            posterior.drives,
+            case.noise,
+            start=_led(posterior, parent.rough.cost if parent else np.inf),
+            iterations=WHITE,
+            tolerance=ROUGH,
+            goal=best.rough.cost if best else np.inf,
+            priors=posterior.problem.priors,
+            seconds=np.inf,
+        )
+    goal = best.log_likelihood - HOPELESS if best else -np.inf
+    z = start.z.copy()
+    z[posterior.shared] = posterior.past.z
+    top = posterior.climb(z, goal)
+    if parent and top.spot.found.average.log_likelihood < parent.log_likelihood:
+        try:
+            other = posterior.climb(_beside(posterior, parent), goal)
+        except SimulationError:
+            other = top
+        top = max(top, other, key=lambda t: t.spot.height)
+    return _weighed(case, posterior, top, start)
+
+
+def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
+    """Return the unknowns at the parent's maximum, with a small share of each effect that it has not."""
+    problem, plant = posterior.problem, posterior.plant.parameters
+    small = {
+        e.own[p.name]: p.null + SHARE * (plant[e.own[p.name]].value - p.null)
+        for e in posterior.effects
+        if e.key not in parent.hypothesis.keys
+        for p in e.candidate.effect.parameters
+        if e.own.get(p.name) in plant and p.fades(e.candidate.effect.shapes)
+    }
+    z = problem.start(small)
+    place = {unknown: k for k, unknown in enumerate(problem.unknowns)}
+    for unknown, value in zip(parent.fit.unknowns, parent.fit.z, strict=True):
+        if unknown in place:
+            z[place[unknown]] = value
+    z[posterior.shared] = posterior.past.z
+    return z
+
+
+def _led(posterior: Posterior, parent: float) -> np.ndarray:
+    """Return the unknowns from which a refit starts: the effects at full size, if these improve the fit.
+
+    The plant's own parameters may have imitated the effect. Then its full size gives a cost above `parent`,
+    that of the refit without it. In that case one Gauss-Newton step is taken from a small share of the
+    effect. Sizes and the plant's parameters change in this step, shapes do not. Of the three points the one
+    with the least cost is the start."""
+    problem = posterior.problem
+    full = problem.start({})
+    costs = [_cost(problem, full)]
+    plant = posterior.plant.parameters
+    names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.sizes.items() if p.amplitude}
+    if costs[0] < parent or not names:
+        return full
+    small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
+    own = {n for e in posterior.effects for n in e.own.values()}
+    free = np.array([k for k, (q, _) in enumerate(problem.unknowns) if q not in own or q in names])
+    try:
+        led = _along_values(posterior, small, problem.evaluate(small, True), free)
+    except SimulationError:
+        return full
+    starts = [full, small, led]
+    costs += [_cost(problem, small), _cost(problem, led)]
+    return starts[int(np.argmin(costs))]
+
+
+def _cost(problem: Problem, z: np.ndarray) -> float:
+    try:
+        return problem.evaluate(z, False).cost
+    except SimulationError:
+        return float("inf")
+
+
+def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np.ndarray) -> np.ndarray:
+    """Return z after one Gauss-Newton step of the unknowns `free`, straight in the values of the parameters.
+
+    A parameter that an effect replaces goes towards zero. Its logarithmic scale would bend that path."""
+    problem = posterior.problem
+    values, _ = problem.unpack(z)
+    low, high = (bound - z for bound in posterior.bounds)
+    at, slope = z.copy(), np.ones(len(z))
+    for k, (q, r) in enumerate(problem.unknowns[: problem.n_parameters]):
+        scale = problem.scales[q]
+        at[k] = float(values[r or 0, posterior.model.parameters.index(q)])
+        slope[k] = scale.slope(at[k])
+        low[k], high[k] = (scale.low - at[k]) / slope[k], (scale.high - at[k]) / slope[k]
+    zero = np.zeros(len(free))
+    part, bounds = now.matrix[np.ix_(free, free)], (low[free], high[free])
+    step, _ = bounded_step(zero, now.gradient[free], part, 0.0, bounds)
+    out = z.copy()
+    for k, change in zip(free, step, strict=True):
+        if k < problem.n_parameters:
+            scale = problem.scales[problem.unknowns[k][0]]
+            out[k] = scale.z(float(np.clip(at[k] + slope[k] * change, scale.low, scale.high)))
+        else:
+            out[k] = z[k] + change
+    return out
+
+
+def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
+    """Laplace's evidence at the maximum."""
+    problem, z, matrix = posterior.problem, top.spot.z, top.matrix
+    average, powers, errors = top.spot.found.average, top.spot.found.powers, top.spot.found.errors
+    values, dx0 = problem.unpack(z)
+    own, parameters = np.ones(len(z), bool), np.arange(len(z)) < problem.n_parameters
+    own[np.concatenate([gaussian(posterior), posterior.believed])] = False
+    confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
+    confined = relieved(confined, posterior.relief(z, top.spot.found.rows, average))
+    bounds = at_bound(problem, z)
+    sd = deviations(posterior, values, confined, bounds)
+    volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
+    found = Fit(
+        posterior.model,
+        values,
+        dx0,
+        -2 * average.log_likelihood,
+        problem.unknowns,
+        z,
+        kept(matrix, parameters),
+        errors,
+        case.noise,
+        top.steps,
+        problem.samples,
+        bounds,
+        problem.priors,
+        converged=top.converged,
+        left=2 * top.left,
+    )
+    # with hundreds of recordings the starts' part fills the memory
+    rough = dataclasses.replace(
+        rough, hessian=kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
+    )
+    rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
+    if not problem.keeps:
+        found, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (found, rough))
+    return Fitted(
+        Hypothesis(tuple(posterior.effects)),
+        updated(posterior.plant, found, posterior.drives),
+        found,
+        average.log_likelihood,
+        log_density(posterior, z, sd),
+        volume,
+        average,
+        tuple(powers),
+        sd,
+        updated(posterior.plant, rough, posterior.drives),
+        rough,
+        tuple(rough_powers),
+        kept(confined, np.array([r is None for _, r in problem.unknowns], bool)),
+        posterior.past,
+    )
+
+
+def remembered(case: Case, f: Fitted) -> Past:
+    """Return what all recordings so far say of a hypothesis."""
+    shared = np.array([r is None for _, r in f.fit.unknowns], bool)
+    names = tuple(q for q, r in f.fit.unknowns if r is None)
+    at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
+    return Past(
+        placed_before(f.hypothesis.effects, f.plant),
+        names,
+        tuple(f.plant.parameters[q].range or (0.0, 0.0) for q in names),
+        f.fit.z[shared],
+        f.curvature,
+        f.log_evidence,
+        {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
+        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
+    )
+
+
+def placed_before(effects: Sequence[Placed], plant: Plant) -> tuple[PlacedBefore, ...]:
+    """Return the effects with the values and ranges that the plant has for them."""
+    return tuple(
+        PlacedBefore(
+            e.key,
+            e.candidate.label,
+            {p: plant.parameters[n].value for p, n in e.own.items()},
+            {p: r for p, n in e.own.items() if (r := plant.parameters[n].range)},
+        )
+        for e in effects
+    )
+
+
+def as_refitted(case: Case, f: Fitted) -> Fitted:
+    """The hypothesis as an ordinary refit in white noise leaves it, for comparison."""
+    average = averaged(case.grids, f.rough_powers)
+    return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
+
+
+def as_weighed(f: Fitted) -> Fitted:
+    """The hypothesis with the fit of its evidence as starting point, too: one more term is weighed there."""
+    return dataclasses.replace(f, rough_plant=f.plant, rough=f.fit, rough_powers=f.powers)
+
+
+def with_residuals(case: Case, f: Fitted) -> Fitted:
+    """Return the fitted hypothesis with its residuals; those of long recordings were not kept."""
+    if f.fit.residuals:
+        return f
+    drives, found = case.drives(f.fit.model), f.fit
+    errors = [
+        d.y - found.model.run(d, values, dx0).y
+        for d, values, dx0 in zip(drives, found.values, found.dx0, strict=True)
+    ]
+    return dataclasses.replace(f, fit=dataclasses.replace(found, residuals=errors))
+
+
+def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
+    """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`.
+
+    The catalogue's own priors are Gaussians, too: their curvature is the precision."""
+    values, _ = posterior.problem.unpack(z)
+    stated = posterior.problem.prior_terms(values, True)[2]
+    out = posterior.prior(z)
+    for precision, ks in ((posterior.precision, gaussian(posterior)), (stated, posterior.believed)):
+        out += 0.5 * float(np.linalg.slogdet(precision[np.ix_(ks, ks)] / (2 * np.pi))[1])
+    for k, (_, p) in posterior.sizes.items():
+        q = posterior.problem.unknowns[k][0]
+        if k not in posterior.shared:
+            value = float(values[0, posterior.model.parameters.index(q)])
+            out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
+    new = [e for e in posterior.effects if e.key not in posterior.past.keys]
+    periods = sum(kind == "periods" for e in new for kind in e.candidate.effect.shapes.values())
+    return out - periods * float(np.log(PERIODS))
+
+
+def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
+    """Return log p(D | z) + log p(z), the integrand of `log_evidence`; sizes' sd are those of `found`."""
+    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
+        posterior, z, found.sd
+    )
+
+
+def _size(p: EffectParameter, value: float, sd: float) -> float:
+    """Return the log prior density of an effect's size: log-uniform over DECADES decades or its bounds.
+
+    Below its standard deviation the density is nearly constant."""
+    low, high = sorted((abs(p.low - p.null), abs(p.high - p.null)))
+    one_sided = p.low >= p.null or p.high <= p.null
+    decades = min(DECADES, np.log10(high / low)) if one_sided and 0 < low < high < np.inf else DECADES
+    return -float(np.log(np.log(10.0) * decades * (1 if one_sided else 2) * np.hypot(value - p.null, sd)))

@@ -1,0 +1,154 @@
+"""Score of a hypothesis on data that took no part in any choice: measured once, after all choices."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtr
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.rows import means
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.plant import refit
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.recording.table import Table
+
+ENOUGH = 3  # recordings, from which the last one is set aside
+BLOCKS = 16  # of a recording. Where recordings are too few, every other one is fitted and the rest checked
+
+
+@dataclass(frozen=True)
+class Worth:
+    """Root-mean-square errors per output of the original plant, refitted, and with the findings.
+
+    `noise`: standard deviation of each output's noise. `reserved`: on recordings set aside; otherwise
+    cross-validated, on data that took part in the choice.
+    `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
+    without such recordings."""
+
+    before: dict[str, float]
+    refit_only: dict[str, float]
+    after: dict[str, float]
+    reserved: bool
+    names: tuple[str, ...]
+    noise: dict[str, float]
+    worse: float = 0.0
+
+    @property
+    def share_closed(self) -> float | None:
+        """Share of the energy beyond the noise, summed over outputs, that the findings close."""
+        before, after = (
+            sum(max((rms.get(o, np.inf) / self.noise[o]) ** 2 - 1, 0.0) for o in self.refit_only)
+            for rms in (self.refit_only, self.after)
+        )
+        return float(1 - after / before) if before > 0 and np.isfinite(after) else None
+
+
+def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Table], list[Table]]:
+    """The recordings to choose on, and those set aside."""
+    if held_out or len(tables) < ENOUGH:
+        return list(tables), list(held_out)
+    return list(tables[:-1]), list(tables[-1:])
+
+
+def worth(
+    case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table], known: Worth | None = None
+) -> Worth:
+    """Errors on the reserve; without one, on every other block, the plants refitted to the rest.
+
+    `known`: of another hypothesis, whose errors without the findings are the same."""
+    noise = {o: n.sigma for o, n in zip(case.plant.outputs, case.noise, strict=True)}
+    if reserve:
+        if case.block > 1:
+            reserve = [means(compile_plant(null.plant), t, case.block) for t in reserve]
+
+        names, model = tuple(t.name for t in reserve), null.fit.model
+        after = [errors_aside(case, best.plant, t) for t in reserve]
+        if known:
+            return dataclasses.replace(known, after=_rms(after, model))
+        came, alone = ([errors_aside(case, plant, t) for t in reserve] for plant in (case.plant, null.plant))
+        sizes = [_rms(errors, model) for errors in (came, alone, after)]
+        return Worth(sizes[0], sizes[1], sizes[2], True, names, noise, worse(alone, after))
+    before = _rms([errors_aside(case, case.plant, t) for t in case.tables], null.fit.model)
+    return Worth(before, _crossed(case, null), _crossed(case, best), False, (), noise)
+
+
+def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
+    """Return the probability that errors `after` are larger than those `alone`, as a mean over all time.
+
+    Differences of squares, each over its output's sum of squares, are summed over blocks: errors are not
+    independent from row to row (Diebold & Mariano 1995). The blocks' mean has Student's t distribution."""
+    if not all(np.isfinite(a[np.isfinite(b)]).all() for b, a in zip(alone, after, strict=True)):
+        return 1.0  # a simulation failed
+    size = np.nansum(np.concatenate(alone) ** 2, axis=0)
+    seen = size > 0
+    blocks = [
+        float(np.nansum((a[part][:, seen] ** 2 - b[part][:, seen] ** 2) / size[seen]))
+        for b, a in zip(alone, after, strict=True)
+        for part in np.array_split(np.arange(len(a)), BLOCKS)
+    ]
+    mean, spread = float(np.mean(blocks)), float(np.std(blocks, ddof=1)) / np.sqrt(len(blocks))
+    return float(stdtr(len(blocks) - 1, mean / spread)) if spread > 0 else float(mean > 0)
+
+
+def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
+    joined = np.concatenate(errors)
+    return {
+        o: float(np.sqrt(np.nanmean(joined[:, j] ** 2)))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(joined[:, j]).any()
+    }
+
+
+def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
+    """Free-run errors on a recording that took no part, less what its uncertain start explains."""
+    model = compile_plant(plant)
+    d = model.prepare(model.excitation(table))
+    try:
+        run = model.run(d, None, None, sensitivities=True)
+    except SimulationError:
+        return np.full_like(d.y, np.nan)
+    assert run.dy is not None
+    error, good = d.y - run.y, np.isfinite(d.y)
+    if not model.uncertain:
+        return error
+    scale = np.array([n.sigma for n in case.noise])
+    start = run.dy[:, :, len(model.active) :]
+    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
+    rows, rest = (start / scale[None, :, None])[good] * prior, (error / scale)[good]
+    return error - start @ (np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ rest) * prior)
+
+
+def _crossed(case: Case, f: Fitted) -> dict[str, float]:
+    """Errors on each half of the blocks, the plant refitted to the other half."""
+    measured = {o.column for o in case.plant.outputs.values()}
+    errors = []
+    for parity in (0, 1):  # the first block is always fitted: an effect of the start is seen only there
+        train = [_masked(t, measured, parity, True) for t in case.tables]
+        model = compile_plant(f.plant)
+        drives = [model.excitation(t) for t in train]
+        try:
+            found = refit.fit(
+                model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
+            )
+            for r, t in enumerate(case.tables):
+                aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
+                d = dataclasses.replace(drives[r], y=aside)  # its start is that of the whole recording
+                errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
+        except SimulationError:
+            errors += [np.full((len(t), len(model.outputs)), np.nan) for t in case.tables]
+    return _rms(errors, f.fit.model)
+
+
+def _masked(table: Table, measured: set[str], parity: int, first: bool) -> Table:
+    span = (table.t - table.t[0]) / max(float(table.t[-1] - table.t[0]), 1e-300)
+    block = np.minimum(span * BLOCKS, BLOCKS - 1).astype(int)
+    keep = np.where(block == 0, first, block % 2 == parity)
+    return dataclasses.replace(
+        table,
+        columns={k: np.where(keep, v, np.nan) if k in measured else v for k, v in table.columns.items()},
+    )

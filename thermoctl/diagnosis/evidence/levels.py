@@ -1,0 +1,99 @@
+"""The noise that a residual is compared with, and their ratio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import chdtri
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.grids import Grid
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.limits import Limits
+
+PRESENT = 0.5  # probability of a remainder, from which an output's residual holds one
+RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
+
+
+def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
+    """Return the largest variance of a noise that the power of no octave contradicts, up to `Grid.most`.
+
+    Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
+    of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
+    power = g.power(powers) / g.shape
+    octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
+    rows = np.bincount(octave, g.count) - absorbed
+    told = rows > 0
+    allowed = np.bincount(octave, power)[told] / chdtri(rows[told], 1 - RARE)
+    return float(min(allowed.min(initial=g.most), g.most))
+
+
+def timing(case: Case, f: Fitted) -> list[float]:
+    """Return each output's variance beyond its stated noise at all frequencies, as far as uncertain times may
+    add it."""
+    beyond = [floor(g, f.powers, len(f.fit.unknowns)) - g.variance for g in case.grids]
+    return [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
+
+
+def late(case: Case, f: Fitted) -> list[str]:
+    """Return sentences about outputs that uncertain times make more wrong than the stated noise."""
+    out = []
+    for g, v in zip(case.grids, timing(case, f), strict=True):
+        if v > g.variance:
+            name = f.fit.model.outputs[case.coordinates.channels[g.channels[0]].output]
+            unit = case.plant.outputs[name].unit or ""
+            out.append(
+                f"{name} errs by {np.sqrt(v):.2g} {unit} beside its noise, at all frequencies: recorded times that are off by "
+                f"{100 * np.sqrt(v) / g.change:.2g} % of a sampling interval would do that"
+            )
+    return out
+
+
+def rounded(case: Case) -> list[bool]:
+    """Return for each output whether its reading rests on the steps of its rounding.
+
+    Such a reading errs with the signal: a remainder there proves nothing."""
+    drives, outputs = case.drives(case.null.model), list(case.plant.outputs.values())
+    out = []
+    for g in case.grids:
+        j = case.coordinates.channels[g.channels[0]].output
+        step = outputs[j].resolution or 0.0
+        moves = [np.abs(np.diff(d.y[np.isfinite(d.y[:, j]), j])) for d in drives]
+        out.append(bool(step > g.sigma and np.median(np.concatenate(moves)) <= step))
+    return out
+
+
+def remainder(case: Case, f: Fitted) -> float:
+    """Return the largest probability of a remainder at an output whose remainder proves something."""
+    known = zip(f.average.remainder, rounded(case), strict=True)
+    return max((p for p, coarse in known if not coarse), default=0.0)
+
+
+def levels(case: Case, f: Fitted) -> list[float]:
+    """Return the standard deviation of each output's noise: learnt, where the residual holds no remainder.
+
+    A stated noise may be wrong by two standard deviations of its prior either way. Beside a remainder the
+    stated noise counts, and what uncertain times add to it."""
+    out = []
+    for g, late, sensor, p in zip(
+        case.grids, timing(case, f), f.average.sensor, f.average.remainder, strict=True
+    ):
+        wrong = np.exp(2 * g.known)
+        learnt = float(np.clip(sensor, g.variance / wrong, max(g.variance * wrong, g.variance + late)))
+        out.append(float(np.sqrt(learnt if p < PRESENT else g.variance + late)))
+    return out
+
+
+def over_noise(case: Case, f: Fitted) -> list[float]:
+    """Return the rms of each output's residuals over its noise (`levels`)."""
+    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f), strict=True)]
+
+
+def only_noise(case: Case, f: Fitted, limits: Limits) -> bool:
+    """Is the residual about as large as the noise, and no remainder in it certain?"""
+    return max(over_noise(case, f)) <= limits.clean and remainder(case, f) < limits.name
+
+
+def _rms(f: Fitted, g: Grid) -> float:
+    return float(np.sqrt(sum(f.powers[k].sum() for k in g.channels) / g.count.sum()))

@@ -1,0 +1,196 @@
+"""Log marginal likelihood of residuals: sensor noise and remainder averaged over their spectra, not chosen.
+
+In band b of an output, with n rows and power P = sum R^2, a row has this variance (coordinates.py).
+Bands of an output's recordings at the same frequency count as one.
+
+    V_b = c^2 s^2 + j^2 w^2 + q exp(u_b)
+    log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
+
+s is the noise that the plant file states, c its error, log-normal. Recorded times may be off by j sampling
+intervals, log-normal. A reading that changes by w in an interval is then off by j w, at all frequencies as
+its noise is. Where slow parts are stated, s^2 follows their spectrum. q exp(u_b) is the remainder and every
+slow error of the sensor. u is a random walk over log frequency: smooth, and its size is learnt at each
+frequency. So an error of the plant at one frequency says little about another. But a plant with a large
+error is not exact at any frequency. So at least the share FLOOR of the remainder's energy lies evenly over
+all of them. Errors that nobody will name are small. So the remainder's share of the output's swing has a
+half-normal prior of width SMALL, and q = (SMALL swing)^2.
+
+    log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
+
+Without a remainder the noise has the stated spectrum. Where no slow parts are stated, it has with even odds a
+first-order and a 1/f part, whose sizes and time are log-uniform. These, c, j and u are integrated by
+Laplace's method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from thermoctl.diagnosis.data.grids import Grid
+from thermoctl.diagnosis.data.spectra import SLOW as SLOW_PARTS
+from thermoctl.diagnosis.data.spectra import STARTS
+from thermoctl.diagnosis.evidence.densities import NOISE, REMAINDER, SLOW, Density, Spot
+
+ABSENT = 0.5  # prior of no remainder at an output
+WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
+FLOOR = 0.1  # least share of the remainder's energy that is spread evenly over all frequencies
+# Nats of one output: up to LITTLE a predicted rise is taken to first order (rms error 0.02). Up to NEAR the
+# known maxima are the start.
+LITTLE, NEAR = 1.0, 5.0
+LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """A log marginal likelihood and its by-products.
+
+    - `inverse`: E[1/V] in the bands of each channel
+    - `sensor`: the noise's variance, by output
+    - `remainder`: the probability that there is a remainder, by output
+    - `unsure`: covariance (frequencies, frequencies) of 1/V, by output, where it was asked for"""
+
+    log_likelihood: float
+    inverse: list[np.ndarray]
+    sensor: list[float]
+    remainder: list[float]
+    unsure: list[np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Output:
+    """The same of one output; `inverse` (nodes,): E[1/V] at each of its frequencies.
+
+    `at`: x at the maximum of each density."""
+
+    log_likelihood: float
+    inverse: np.ndarray
+    sensor: float
+    remainder: float
+    unsure: np.ndarray
+    at: tuple[np.ndarray, ...]
+
+
+def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray], unsure: bool = False) -> Averaged:
+    """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
+    found = [_output(g, g.power(powers), None, unsure) for g in grids]
+    return Averaged(
+        sum(f.log_likelihood for f in found),
+        _by_channel(grids, [f.inverse for f in found], powers),
+        [f.sensor for f in found],
+        [f.remainder for f in found],
+        [f.unsure for f in found],
+    )
+
+
+def _by_channel(
+    grids: Sequence[Grid], inverse: Sequence[np.ndarray], powers: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return E[1/V] in the bands of each channel, from its values at the frequencies of each output."""
+    out: list[np.ndarray] = [np.zeros(0)] * len(powers)
+    for g, of_output in zip(grids, inverse, strict=True):
+        parts = np.split(of_output[g.node], np.cumsum([len(powers[k]) for k in g.channels])[:-1])
+        for k, part in zip(g.channels, parts, strict=True):
+            out[k] = part
+    return out
+
+
+class Around:
+    """Other powers beside known ones: by how much their log likelihood is above, and their weights.
+
+    d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again; less than
+    NEAR, the maxima are looked for from the known ones."""
+
+    def __init__(self, grids: Sequence[Grid], powers: Sequence[np.ndarray]):
+        self.grids = grids
+        self.known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
+
+    def rise(self, others: Sequence[np.ndarray]) -> float:
+        """Return by how much the log likelihood is above that of the known powers."""
+        return sum(rise for rise, _ in self._each(others))
+
+    def weighed(self, others: Sequence[np.ndarray]) -> tuple[float, list[np.ndarray]]:
+        """Return this, and E[1/V] in the bands of each channel."""
+        found = list(self._each(others))
+        return sum(rise for rise, _ in found), _by_channel(self.grids, [v for _, v in found], others)
+
+    def _each(self, others: Sequence[np.ndarray]) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rise of each output, and E[1/V] at its frequencies."""
+        for g, p, f in self.known:
+            other = g.power(others)
+            first = -0.5 * f.inverse * (other - p)
+            size = float(np.abs(first).sum())
+            if size < LITTLE:
+                yield float(first.sum()), f.inverse
+            else:
+                again = _output(g, other, f.at if size < NEAR else None)
+                yield again.log_likelihood - f.log_likelihood, again.inverse
+
+
+def _output(
+    g: Grid, power: np.ndarray, near: Sequence[np.ndarray] | None = None, unsure: bool = False
+) -> _Output:
+    """Average the likelihood of an output's power at each frequency (nodes,). `near`: x to start from."""
+    power = np.maximum(power, LEAST * g.variance * g.count)
+    kinds = (NOISE, REMAINDER) if g.sensor else (NOISE, SLOW, REMAINDER)
+    densities = [density(g, kind) for kind in kinds]
+    starts: list[np.ndarray | None] = [*near] if near else [None] * len(kinds)
+    found = [d.top(power, x) for d, x in zip(densities, starts, strict=True)]
+    odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
+    scores = np.log(np.append(odds, 1 - ABSENT)) + [
+        log_p(g, kind, *f) for kind, f in zip(kinds, found, strict=True)
+    ]
+    whole = float(scores.max() + np.log(np.exp(scores - scores.max()).sum()))
+    weight = np.exp(scores - whole)
+    each = np.array([1 / at.variance for at, _ in found])
+    mean = weight @ each
+    spread = np.zeros((0, 0))
+    if unsure:
+        apart = each - mean
+        within = sum(w * _unsure(*f) for w, f in zip(weight, found, strict=True))
+        spread = within + (apart.T * weight) @ apart
+    sensor = g.variance * float(
+        weight @ [np.exp(at.x[0]) + g.clock * np.exp(at.x[len(g.scales) - 1]) for at, _ in found]
+    )
+    return _Output(whole, mean, sensor, float(weight[-1]), spread, tuple(at.x for at, _ in found))
+
+
+def density(g: Grid, kind: int) -> Density:
+    """Return one of an output's three densities, made once."""
+    made: dict[int, Density] = g.__dict__.setdefault("densities", {})
+    if kind not in made:
+        made[kind] = Density(
+            kind,
+            g.count,
+            g.shape,
+            g.turn,
+            g.scales,
+            g.variance,
+            g.clock,
+            g.small,
+            FLOOR,
+            SLOW_PARTS,
+            np.diag(g.rough).copy(),
+            np.diag(g.rough, 1).copy(),
+            STARTS,
+            g.slow,
+        )
+    return made[kind]
+
+
+def log_p(g: Grid, kind: int, at: Spot, root: np.ndarray) -> float:
+    """Return log p(R) of a density by Laplace's method, from its maximum and its curvature's root there."""
+    score = at.log_density - 0.5 * float(g.count.sum()) * LOG_2PI - float(np.log(g.scales).sum())
+    if kind == REMAINDER:
+        score += 0.5 * g.log_rough - g.log_small
+    return score - float(np.log(root.diagonal()).sum())
+
+
+def _unsure(at: Spot, root: np.ndarray) -> np.ndarray:
+    """Return the covariance of 1/V."""
+    moves = solve_triangular(root, (at.slope / at.variance[:, None]).T, lower=True)
+    return np.asarray(moves.T @ moves)

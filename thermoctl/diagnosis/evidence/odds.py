@@ -1,0 +1,31 @@
+"""Prior odds of a hypothesis, from the classes of its effects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.evidence.fit import Placed
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.limits import Limits
+
+
+def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
+    """Return the log prior odds of a hypothesis against no effect.
+
+    The odds are shared equally among the entries, and each entry's among its places."""
+    total = 0.0
+    for e in effects:
+        c = e.candidate
+        share = len(where) * len(where.get(c.effect.name, {c.place.where}))
+        total += np.log(limits.missing / (1 - limits.missing) / share)
+        total += rare(c.effect, bool(c.place.input)) * np.log(limits.rare)
+    return float(total)
+
+
+def rare(effect: Effect, of_input: bool) -> int:
+    """Return how many times an effect is rare beside constant physics.
+
+    Once where it depends on the time itself, once where it is a fault of a recorded input."""
+    return effect.timed + (of_input and effect.where != "drive")

@@ -1,0 +1,61 @@
+"""The times of jumps, moved to where they fit best: a refit cannot, since a jump has no slope to follow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.posterior import Placed
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.residuals import Problem
+from thermoctl.plant.simulate import SimulationError
+
+TIMES = ("onset", "start", "end")  # shapes that are the time of a jump
+ONSETS = 24  # onset times of a screening's grid over the recordings
+FINER = 4  # factor from one grid to the next
+GAIN = 2.0  # of the squared errors over the noise, from which a time is moved: one nat
+
+
+def moved(case: Case, plant: Plant, effects: Sequence[Placed], found: Fit) -> Plant | None:
+    """Return a refitted plant with the times of its jumps moved, all else as it is; None if none fits better.
+
+    Each time is looked for on grids about it, from the screening's to half a sample."""
+    own = {e.own.get(p.name) for e in effects for p in e.candidate.effect.parameters if p.shape in TIMES}
+    times = {q: k for k, (q, r) in enumerate(found.unknowns) if q in own and r is None}
+    if not times:
+        return None
+    drives = case.drives(found.model)
+    problem = Problem(found.model, drives, case.noise, found.priors)
+    duration = max(float(d.t[-1]) for d in drives)
+    sample = min(float(np.median(np.diff(d.t))) for d in drives)
+
+    def cost(z: np.ndarray) -> float:
+        """Return the cost of the unknowns z; infinite where the simulation fails."""
+        try:
+            return problem.evaluate(z, False).cost
+        except SimulationError:
+            return float("inf")
+
+    z = found.z.copy()
+    first = least = cost(z)
+    for q, k in times.items():
+        step = duration / ONSETS
+        while step > 0.5 * sample:
+            middle = problem.scales[q].value(z[k])
+            for at in middle + step * np.arange(1 - FINER, FINER) / FINER:
+                trial = z.copy()
+                trial[k] = problem.scales[q].z(float(np.clip(at, 0.0, duration)))
+                if at != middle and (now := cost(trial)) < least:
+                    z, least = trial, now
+            step /= FINER
+    if not least < first - GAIN:
+        return None
+    parameters = {
+        q: dataclasses.replace(plant.parameters[q], value=float(problem.scales[q].value(z[k])))
+        for q, k in times.items()
+    }
+    return dataclasses.replace(plant, parameters={**plant.parameters, **parameters})

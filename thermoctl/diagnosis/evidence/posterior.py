@@ -1,0 +1,334 @@
+"""The log posterior of one hypothesis' parameters, and its maximum.
+
+    log p(z | D) = log p(D | z) + log p(z) + constant
+
+log p(D | z) is averaged over noise and remainder (noise.py). Its maximum is climbed by plant/climb.py; with
+the weights E[1/V] the gradient is exact. Gradient and curvature are sums over recordings:
+one recording at a time is simulated, and its sums are added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.coordinates import Channel, transform
+from thermoctl.diagnosis.evidence.noise import Averaged, averaged
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.plant import expression as ex
+from thermoctl.plant.climb import Climbed, Spot, climb
+from thermoctl.plant.language import Plant
+from thermoctl.plant.residuals import HUGE, PROBE, Problem
+from thermoctl.plant.simulate import SimulationError, compile_plant
+
+BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
+ROUNDS = 40  # largest number of steps
+FAR = 8.0  # standard deviations that a start may be off
+ENOUGH = 0.05  # of the log posterior, promised by a step, below which none is taken
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at a place, and the parameters that it adds to the plant."""
+
+    candidate: Candidate
+    own: Mapping[str, str]  # its parameter: the plant's name
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Return (name of the effect, name of its place): the key of the placed effect."""
+        return self.candidate.key
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """The placed effects that are assumed to be missing. Every hypothesis holds a remainder besides."""
+
+    effects: tuple[Placed, ...] = ()
+
+    @property
+    def keys(self) -> frozenset[tuple[str, str]]:
+        """The (effect, where) of each."""
+        return frozenset(e.key for e in self.effects)
+
+
+# z, and each recording's unknowns and its channels' slopes (rows, k) there
+Slopes = tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The free-run errors at a point, their rows, likelihood and powers; slopes where they are kept."""
+
+    errors: list[np.ndarray]
+    rows: list[np.ndarray]
+    average: Averaged
+    powers: list[np.ndarray]
+    slopes: Slopes | None
+
+
+@dataclass(frozen=True)
+class Sums:
+    """One recording's share of gradient and curvature of the log likelihood, by its unknowns (k,).
+
+    - `gradient` (k,), `matrix` (k, k): J' E[1/V] R and J' E[1/V] J
+    - `by_band`: of each channel J' R in each band (bands, k)"""
+
+    unknowns: np.ndarray
+    gradient: np.ndarray
+    matrix: np.ndarray
+    by_band: list[np.ndarray]
+
+
+def _slopes(
+    problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return a recording's free-run errors, its unknowns (k,) and its channels' slopes (rows, k)."""
+    d, buffers = problem.excitations[r], problem.buffers
+    run = problem.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
+    used, unknowns, slope = problem.slopes(r, values)
+    assert run.dy is not None
+    return d.y - run.y, unknowns, [transform(c, run.dy[:, c.output, used]) * slope for c in channels]
+
+
+def _sums(
+    channels: Sequence[Channel],
+    unknowns: np.ndarray,
+    slopes: Iterable[np.ndarray],
+    rows: Sequence[np.ndarray],
+    inverse: Sequence[np.ndarray],
+) -> Sums:
+    """Return a recording's sums from its channels' slopes, residuals' rows and weights of bands."""
+    k = len(unknowns)
+    gradient, matrix, by_band = np.zeros(k), np.zeros((k, k)), []
+    for c, jac, row, weight in zip(channels, slopes, rows, inverse, strict=True):
+        w = np.sqrt(weight[c.band])
+        j = jac * w[:, None]
+        gradient += j.T @ (w * row)
+        matrix += j.T @ j
+        starts = np.cumsum(c.count) - c.count
+        by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))
+    return Sums(unknowns, gradient, matrix, by_band)
+
+
+def _simulated_sums(
+    problem: Problem,
+    r: int,
+    values: np.ndarray,
+    dx0: np.ndarray,
+    channels: Sequence[Channel],
+    rows: Sequence[np.ndarray],
+    inverse: Sequence[np.ndarray],
+) -> Sums:
+    """Return a recording's sums; its slopes are computed, and forgotten."""
+    run = problem.model.run(problem.excitations[r], values, dx0, sensitivities=True, states=False)
+    used, unknowns, slope = problem.slopes(r, values)
+    assert run.dy is not None
+    dy = run.dy  # of one channel at a time copies are made: a recording has megabytes
+    slopes = (transform(c, dy[:, c.output, used]) * slope for c in channels)
+    return _sums(channels, unknowns, slopes, rows, inverse)
+
+
+class Posterior:
+    """The log posterior of one hypothesis' parameters, and its Gauss-Newton steps."""
+
+    def __init__(self, case: Case, plant: Plant, effects: Sequence[Placed]):
+        self.case, self.plant, self.effects = case, plant, effects
+        self.model = compile_plant(plant)
+        self.drives = case.drives(self.model)
+        for d in self.drives:
+            self.model.prepare(d)
+        self.problem = Problem(self.model, self.drives, case.noise)
+        self.sizes, self.mean, precision = _priors(case, self.problem, effects)
+        self.past = case.memory.of(frozenset(e.key for e in effects), plant)
+        place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
+        self.shared = np.array([place[q] for q in self.past.unknowns], int)
+        self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
+        self.precision = np.diag(precision)
+        self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
+        beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
+        self.problem.priors = tuple(beliefs)
+        # the unknowns (k,) that the catalogue gives a prior of their own
+        stated = self.problem.prior_terms(self.problem.unpack(self.problem.z_plant)[0], True)[2]
+        self.believed = np.setdiff1d(np.flatnonzero(stated.any(axis=0)), self.shared)
+        coordinates = case.coordinates
+        self.channels = [coordinates.of_recording(r) for r in range(len(self.drives))]
+        self.kept: Slopes | None = None
+        self.newest: tuple[np.ndarray, Sequence[Sums]] | None = None
+
+    def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(N, outputs, ...) of each recording as rows of each channel."""
+        return [transform(c, e[c.recording][:, c.output]) for c in self.case.coordinates.channels]
+
+    def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
+        """The averaged likelihood of residuals' rows, and their powers."""
+        powers = self.case.coordinates.powers(rows)
+        return averaged(self.case.grids, powers), powers
+
+    def errors(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors. Raises SimulationError."""
+        return self._checked(self.problem.each(Problem.errors, self.problem.unpack(z), lambda r: (), 1))
+
+    def _checked(self, errors: list[np.ndarray]) -> list[np.ndarray]:
+        if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
+            raise SimulationError("the simulation gives values that are not numbers")
+        return errors
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Between which the unknowns lie."""
+        n, m = self.problem.n_parameters, len(self.problem.unknowns)
+        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
+            [np.ones(n), np.full(m - n, FAR)]
+        )
+
+    def prior(self, z: np.ndarray) -> float:
+        """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
+
+        It is the sum of the Gaussian priors and of the priors that the catalogue's entries state."""
+        values, _ = self.problem.unpack(z)
+        return (
+            -0.5 * float((z - self.mean) @ self.precision @ (z - self.mean))
+            - 0.5 * self.problem.prior_terms(values, False)[0]
+        )
+
+    def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
+        """Free-run errors; slopes are kept for `sums`, if they are not too many. Raises SimulationError.
+
+        One run costs less than two."""
+        if not self.problem.keeps:
+            return self.errors(z)
+        parts = self.problem.each(_slopes, self.problem.unpack(z), lambda r: (self.channels[r],), 2)
+        errors = self._checked([e for e, _, _ in parts])
+        self.kept = z.copy(), [(unknowns, slopes) for _, unknowns, slopes in parts]
+        return errors
+
+    def sums(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> Sequence[Sums]:
+        """Return what each recording adds to gradient and curvature.
+
+        `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel."""
+        data, at = [], 0
+        for channels in self.channels:
+            end = at + len(channels)
+            data.append((rows[at:end], inverse[at:end]))
+            at = end
+        if not self.problem.keeps:
+            point = self.problem.unpack(z)
+            return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r]), 2)
+        if self.kept is None or not np.array_equal(self.kept[0], z):
+            self.errors_and_slopes(z)
+        assert self.kept is not None
+        return [_sums(c, *slopes, *d) for c, slopes, d in zip(self.channels, self.kept[1], data, strict=True)]
+
+    def slope(
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the log posterior, and minus its second derivative."""
+        n = len(z)
+        gradient, matrix = np.zeros(n), np.zeros((n, n))
+        self.newest = z.copy(), self.sums(z, rows, inverse)
+        for s in self.newest[1]:
+            gradient[s.unknowns] += s.gradient
+            matrix[np.ix_(s.unknowns, s.unknowns)] += s.matrix
+        values, _ = self.problem.unpack(z)
+        _, push, bend = self.problem.prior_terms(values, True)
+        return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
+
+    def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
+        """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
+        out = np.zeros((len(z), len(z)))
+        if self.newest is None or not np.array_equal(self.newest[0], z):
+            self.slope(z, rows, average.inverse)
+        assert self.newest is not None
+        by_band = [(s.unknowns, x) for s in self.newest[1] for x in s.by_band]
+        powers = self.case.coordinates.powers(rows)
+        for g, unsure in zip(self.case.grids, averaged(self.case.grids, powers, True).unsure, strict=True):
+            pull = np.zeros((len(unsure), len(z)))
+            at = 0
+            for k in g.channels:
+                unknowns, x = by_band[k]
+                np.add.at(pull, np.ix_(g.node[at : at + len(x)], unknowns), x)  # two bands may share a node
+                at += len(x)
+            out += pull.T @ unsure @ pull
+        return out
+
+    @property
+    def few(self) -> bool:
+        """Should a trial step compute slopes at once?"""
+        return self.problem.few
+
+    def look(self, z: np.ndarray, slopes: bool) -> Spot[Seen]:
+        """The log posterior at z."""
+        kept = self.kept
+        errors = self.errors_and_slopes(z) if slopes else self.errors(z)
+        slopes_here, self.kept = self.kept if slopes else None, kept
+        rows = self.rows(errors)
+        average, powers = self.likelihood(rows)
+        return Spot(
+            z, average.log_likelihood + self.prior(z), Seen(errors, rows, average, powers, slopes_here)
+        )
+
+    def stand(self, spot: Spot[Seen]) -> tuple[np.ndarray, np.ndarray]:
+        """Return gradient and minus the second derivative of the log posterior."""
+        self.kept = spot.found.slopes
+        return self.slope(spot.z, spot.found.rows, spot.found.average.inverse)
+
+    def bend(self, spot: Spot[Seen], step: np.ndarray) -> np.ndarray:
+        """Weighed by E[1/V] of the spot. Zeros where the recordings are too many to keep their slopes."""
+        out = np.zeros_like(step)
+        if self.kept is None:
+            return out
+        moved = self.rows(self.errors(spot.z + PROBE * step))
+        channels, seen, at = self.case.coordinates.channels, spot.found, 0
+        for unknowns, slopes in self.kept[1]:
+            for jac in slopes:
+                second = (moved[at] - seen.rows[at]) / PROBE + jac @ step[unknowns]
+                np.add.at(out, unknowns, jac.T @ (seen.average.inverse[at][channels[at].band] * second))
+                at += 1
+        return out * (2 / PROBE)
+
+    def climb(self, z: np.ndarray, goal: float) -> Climbed[Seen]:
+        """Return the maximum near z. Stop early if `goal`, a log likelihood, is out of reach."""
+        return climb(self, z, ROUNDS, lambda height: ENOUGH, goal)
+
+
+def _priors(
+    case: Case, problem: Problem, effects: Sequence[Placed]
+) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
+    """Return which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian.
+
+    A delay is a size, too."""
+    mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
+    own = {
+        e.own[p.name]: (e.candidate, p)
+        for e in effects
+        for p in e.candidate.effect.parameters
+        if p.name in e.own
+    }
+    sizes = {}
+    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
+        precision[k] = BELIEF**-2
+        if q in own:
+            c, p = own[q]
+            told = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
+            mean[k], precision[k] = 0.5, 1e-6 if told else 1e-4
+            if (p.amplitude or c.effect.shapes.get(p.shape or "") == "delays") and not told:
+                sizes[k] = own[q]
+        elif q in case.plant.parameters:
+            mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
+    return sizes, mean, precision
+
+
+def gaussian(posterior: Posterior) -> np.ndarray:
+    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
+    names = {n for e in posterior.effects for n in e.own.values()}
+    return np.array(
+        [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],
+        int,
+    )

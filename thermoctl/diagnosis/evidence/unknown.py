@@ -1,0 +1,86 @@
+"""The remainder that no entry explains: its size in the sensors' units, its node, the signals it follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.levels import levels, over_noise
+from thermoctl.diagnosis.evidence.where import Responses, responses, signals
+from thermoctl.diagnosis.hypothesis.roles import Structure
+
+CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
+
+
+@dataclass(frozen=True)
+class Left:
+    """The part of the residual that the sensors' noise does not explain.
+
+    - `rms`: rms of that part; `noise`: rms of the noise (`levels`); by output, in the output's unit
+    - `over_noise`: rms of the whole residual divided by `noise`, by output
+    - `node`: the node whose random forces explain the residual best
+    - `follows`: signals that correlate with the residual of the output with the largest `over_noise`"""
+
+    rms: dict[str, float]
+    noise: dict[str, float]
+    over_noise: dict[str, float]
+    node: str | None
+    follows: tuple[str, ...]
+
+
+def left(case: Case, f: Fitted, reach: Responses) -> Left:
+    """Measure and locate the residual of a fitted hypothesis."""
+    names = [case.null.model.outputs[case.coordinates.channels[g.channels[0]].output] for g in case.grids]
+    over = dict(zip(names, over_noise(case, f), strict=True))
+    noise = dict(zip(names, levels(case, f), strict=True))
+    rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
+    worst = max(over, key=lambda o: over[o]) if over else ""
+    follow = follows(case, f, worst) if over and over[worst] > 1 else ()
+    return Left(rms, noise, over, next(iter(located(case, f, reach)), None), follow)
+
+
+def reached(case: Case) -> Responses:
+    """How random forces at the nodes of the plant, refitted as it came, reach its outputs."""
+    model = case.null.model
+    rates = set(Structure(case.plant, [], []).pairs.values())  # positions store nothing
+    return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
+
+
+def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
+    """Return the nodes, that whose random forces explain the residuals best first."""
+    scores = {}
+    for i, node in enumerate(reach.nodes):
+        by_cell = np.zeros(len(reach.share))
+        found = reach.cells(case.coordinates, [g.channels for g in case.grids], i)
+        for g, own, cells in zip(case.grids, f.average.sensor, found, strict=True):
+            count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
+            power = np.concatenate([f.powers[k] for k in g.channels])
+            by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
+        scores[node] = float(logsumexp(by_cell))
+    return sorted(scores, key=lambda n: -scores[n])
+
+
+def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
+    """Return signals, or their changes, whose correlation with an output's residual is CORRELATED or more.
+
+    The strongest is first; at most SHOWN."""
+    model, j = f.fit.model, f.fit.model.outputs.index(output)
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for r, d in enumerate(case.drives(model)):
+        values = signals(model, d, f.fit.values[r], model.run(d, f.fit.values[r], f.fit.dx0[r]).x)
+        e = f.fit.residuals[r][:, j]
+        for name in (*model.plant.inputs, *case.plant.nodes):
+            x = np.broadcast_to(np.asarray(values[name], float), d.t.shape)
+            for label, signal in ((name, x), (f"change of {name}", np.gradient(x, d.t))):
+                good = np.isfinite(e) & np.isfinite(signal)
+                a, b = e[good] - e[good].mean(), signal[good] - signal[good].mean()
+                found.setdefault(label, []).append((float(a @ b), float(a @ a), float(b @ b)))
+    size = {}
+    for label, parts in found.items():
+        cross, first, second = np.sum(parts, axis=0)
+        size[label] = abs(cross) / np.sqrt(first * second) if first * second > 0 else 0.0
+    return tuple(sorted((k for k, v in size.items() if v >= CORRELATED), key=lambda k: -size[k])[:SHOWN])

@@ -1,0 +1,137 @@
+"""Where a remainder enters: the node at which small random forces would explain it best.
+
+A white force at node i, with the rms of its typical flow, gives output j the variance F_ij(b) in band b.
+F is measured on the plant, linearised along its own trajectory (`Model.respond`). A few forces are enough:
+each contains some bands of the DCT. A slow force is a first-order process with time constant tau. Its rms is
+the share eta of the typical flow:
+
+    V_j(b) = c^2 s^2 + eta^2 F_ij(b) S_b(tau)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import idct
+
+from thermoctl.diagnosis.data.coordinates import Coordinates, band_edges, transform
+from thermoctl.diagnosis.data.spectra import first_order
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Flow, Plant
+from thermoctl.plant.simulate import Excitation, Model
+
+SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
+CORNERS = 3  # tau, from a fortieth to a quarter of the longest recording
+FORCES = 2  # a node; each holds every second band, so that neighbours' responses do not mix
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Variance of each output by node and cell (eta, tau) over the bands of its recordings."""
+
+    nodes: tuple[str, ...]
+    white: list[np.ndarray]  # per channel (nodes, bands)
+    share: np.ndarray  # (cells,) eta
+    corner: np.ndarray  # (cells,) tau
+    intervals: list[float]  # of the recordings
+
+    def cells(
+        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], node: int
+    ) -> list[np.ndarray]:
+        """(cells, bands) of each output, whose channels are given, of one node's forces."""
+        return [
+            np.concatenate([self._channel(coordinates, k, node) for k in positions], axis=1)
+            for positions in outputs
+        ]
+
+    def _channel(self, coordinates: Coordinates, k: int, node: int) -> np.ndarray:
+        c = coordinates.channels[k]
+        interval = self.intervals[c.recording]
+        slow = [first_order(tau / interval, 2 * np.pi * c.frequency * interval) for tau in self.corner]
+        return self.share[:, None] ** 2 * self.white[k][node] * np.array(slow)
+
+
+def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
+    """Return the geometric mean of the rms flows at a node, over all recordings.
+
+    Not the largest: a large force that only stores and returns energy says little about a missing one."""
+    rates = [typical_rate(f, values) for f in plant.flows.values() if node in (f.source, f.target)]
+    logs = [np.log(r) for r in rates if r > 0]
+    return float(np.exp(np.mean(logs))) if logs else 0.0
+
+
+def typical_rate(f: Flow, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
+    """Return the rms of a flow over all recordings."""
+    square = [float(np.mean(np.asarray(ex.evaluate(f.rate, v), float) ** 2)) for v in values]
+    return float(np.sqrt(np.mean(square)))
+
+
+def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
+    """Every name of the plant along a trajectory."""
+    return {
+        **dict(zip(model.plant.inputs, d.u.T, strict=False)),
+        **dict(zip(model.parameters, map(float, values), strict=True)),
+        **dict(zip(model.states, x.T, strict=True)),
+        "t": d.t,
+        "pi": np.pi,
+    }
+
+
+def white_forces(n: int) -> np.ndarray:
+    """Return forces (n, FORCES) that contain each DCT row once, with size 1 and a fixed random sign."""
+    band = np.repeat(np.arange(len(band_edges(n)) - 1), np.diff(band_edges(n)))
+    rows = np.zeros((n, FORCES))
+    rows[np.arange(n), band % FORCES] = np.random.default_rng(23).choice([-1.0, 1.0], n)
+    return idct(rows, axis=0, norm="ortho")
+
+
+def responses(
+    model: Model,
+    drives: Sequence[Excitation],
+    values: np.ndarray,
+    dx0: np.ndarray,
+    coordinates: Coordinates,
+    skip: set[str],
+) -> Responses:
+    """Return the responses to forces at the nodes, for parameter values (recordings, parameters).
+
+    `skip`: nodes that store nothing (a position)."""
+    nodes = tuple(
+        n
+        for n in model.plant.nodes
+        if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
+    )
+    white: dict[int, np.ndarray] = {}
+    trajectories = [
+        signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
+    ]
+    size = [typical_flow(model.plant, n, trajectories) for n in nodes]
+    for r, d in enumerate(drives):
+        forces, q = [], []
+        white_force = white_forces(len(d.t))
+        for i, n in enumerate(nodes):
+            storage = np.broadcast_to(
+                np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
+            )
+            for k in range(FORCES):
+                forces.append((model.states.index(n), i * FORCES + k))
+                q.append(white_force[:, k] * size[i] / storage)
+        count = len(nodes) * FORCES
+        dy = model.respond(d, values[r], dx0[r], forces, np.stack(q, axis=1), count) if count else None
+        for k, c in enumerate(coordinates.channels):
+            if c.recording != r:
+                continue
+            white[k] = np.zeros((len(nodes), len(c.count)))
+            if dy is not None:
+                rows = transform(c, dy[:, c.output]) ** 2
+                mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
+                white[k] = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
+    span = max(float(d.t[-1] - d.t[0]) for d in drives)
+    intervals = [float(np.median(np.diff(d.t))) for d in drives]
+    taus = np.geomspace(span / 40, span / 4, CORNERS)
+    share, corner = np.meshgrid(SHARES, taus, indexing="ij")
+    return Responses(
+        nodes, [white[k] for k in range(len(coordinates.channels))], share.ravel(), corner.ravel(), intervals
+    )

@@ -1,0 +1,390 @@
+"""The experiment that decides between the hypotheses left, best per hour of rig time.
+
+Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. The uncertainty left in their
+parameters counts against them (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983) 225), with R the noise's
+covariance, J = dy/dz, P = cov z:
+
+    D_ab = (y_a - y_b)' (R + J_a P_a J_a' + J_b P_b J_b')^-1 (y_a - y_b)          (1)
+
+The experiment's information on which hypothesis is true, in bits (lower bound of Kolchinsky & Tracey, Entropy
+19 (2017) 361):
+
+    I = -sum_a w_a log2 sum_b w_b exp(-D_ab / 8)                                  (2)
+
+Chosen is the most I per hour among those that reach ENOUGH of the best I. Every reading, as every hypothesis
+predicts it, stays inside its recorded range, unless limits are given. Where no candidate stays inside, the
+inputs' excursions are made smaller (SHARES)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, with_residuals
+from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Limits, family, levers
+from thermoctl.diagnosis.experiment.file import FILES
+from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.law.result import described
+from thermoctl.diagnosis.result import Diagnosis
+from thermoctl.plant.residuals import Scale
+from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+MOST = 5  # hypotheses that are compared
+LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time
+POINTS, READINGS = 700, 4000  # of a simulated experiment, at most; thinned readings count as less noisy ones
+FEWEST_POINTS = 150  # of a simulated experiment, however many outputs it has
+TRIALS, FEWEST_TRIALS = 150, 40  # candidates that are simulated, at most; of more, evenly chosen ones
+NUMBERS = 2e8  # slopes that all trials compute, at most: a plant of many bodies gets fewer trials
+ENOUGH = 0.8  # of the best experiment's bits that a shorter one must reach
+SHARES = (
+    1.0,
+    0.7,
+    0.5,
+    0.3,
+)  # of the inputs' recorded excursion from rest: the largest that keeps readings inside
+DECIDES = 20.0  # D that decides: mean odds of e^(D/2) for one of two
+IN_RANGE = (
+    0.09  # variance of a parameter that is new in every recording: anything within its range (z from 0 to 1)
+)
+WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
+
+Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
+Prediction = tuple[np.ndarray, np.ndarray]  # readings (N, ny), and their uncertainty (N, ny, z)
+
+
+@dataclass
+class _Predictor:
+    """A fitted hypothesis ready to predict, with the root of its parameters' covariance."""
+
+    label: str
+    weight: float
+    model: Model
+    root: np.ndarray  # (z, z), P = root root'
+    slopes: np.ndarray  # dq / dz of the model's uncertain unknowns, else 0
+
+    def predict(self, table: Table, states: bool = False) -> Prediction | None:
+        """Simulate an experiment; None where that fails. With `states`, these follow the readings."""
+        try:
+            run = self.model.run(self.model.excitation(table), sensitivities=True, rtol=1e-5, states=states)
+        except (SimulationError, InputError):
+            return None
+        assert run.dy is not None
+        y, slopes = run.y, run.dy
+        if states and run.dx is not None:
+            y, slopes = np.concatenate([y, run.x], axis=1), np.concatenate([slopes, run.dx], axis=1)
+        slopes = slopes * self.slopes @ self.root
+        return (y, slopes) if np.all(np.isfinite(y)) and np.all(np.isfinite(slopes)) else None
+
+
+def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
+    model = compile_plant(f.plant)
+    covariance = np.linalg.pinv(f.curvature, hermitian=True)
+    place = {q: k for k, q in enumerate(q for q, r in f.fit.unknowns if r is None)}
+    nq = len(model.unknowns)
+    P, slopes = np.eye(nq), np.zeros(nq)
+    for c, q in enumerate(model.unknowns):
+        p = model.plant.parameters.get(q)
+        if c < len(model.active) and p is not None and p.range:
+            slopes[c] = Scale(p).slope(p.value)
+            P[c, c] = IN_RANGE
+        elif c >= len(model.active):
+            slopes[c] = model.plant.nodes[model.uncertain[c - len(model.active)]].initial_sigma or 0.0
+    known = [c for c, q in enumerate(model.unknowns) if q in place and slopes[c]]
+    index = [place[model.unknowns[c]] for c in known]
+    P[np.ix_(known, known)] = covariance[np.ix_(index, index)]
+    P[np.diag_indices(nq)] = np.minimum(np.diag(P), 1.0)  # no parameter is more uncertain than its range
+    values, vectors = np.linalg.eigh((P + P.T) / 2)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return _Predictor(label, weight, model, root, slopes)
+
+
+def distances(
+    predictions: Sequence[Prediction], columns: Sequence[Sequence[int]], sigma: np.ndarray
+) -> np.ndarray:
+    """Compute D of (1) of every two predictions over their columns, by Woodbury's identity.
+
+    `sigma`: noise of each column.
+
+    Each pair's matrix consists of products that several pairs share."""
+    y, load = (
+        [
+            np.concatenate([p[part][:, j] / s for j, s in zip(own, sigma, strict=True)])
+            for p, own in zip(predictions, columns, strict=True)
+        ]
+        for part in (0, 1)
+    )
+    own = [np.eye(x.shape[1]) + x.T @ x for x in load]
+    D = np.zeros((len(y), len(y)))
+    for a in range(len(y)):
+        for b in range(a):
+            difference = y[a] - y[b]
+            inner = np.concatenate([load[a].T @ difference, load[b].T @ difference])
+            cross = load[a].T @ load[b]
+            taken = np.linalg.solve(np.block([[own[a], cross], [cross.T, own[b]]]), inner)
+            D[a, b] = D[b, a] = float(max(difference @ difference - inner @ taken, 0.0))
+    return D
+
+
+def bits(D: np.ndarray, weights: np.ndarray) -> float:
+    """Compute I of (2)."""
+    return float(-weights @ np.log2(np.exp(-D / 8) @ weights))
+
+
+def noise_of(case: Case, f: Fitted) -> np.ndarray:
+    """Estimate the uncertainty of one reading, per output (ny,).
+
+    Rms residual of the likeliest hypothesis, at least the sensor's noise.
+
+    It is widened for the correlation of neighbours, whose mean tells less than that of independent
+    readings."""
+    out = []
+    for o, n in zip(case.null.model.outputs, case.noise, strict=True):
+        j = f.fit.model.outputs.index(o)
+        r = [q[np.isfinite(q[:, j]), j] for q in f.fit.residuals]
+        r = [q for q in r if len(q) > 8]
+        square = np.concatenate([q**2 for q in r]).mean() if r else n.sigma**2
+        lag = (
+            np.sum([np.sum(q[1:] * q[:-1]) for q in r]) / max(np.sum([np.sum(q**2) for q in r]), 1e-300)
+            if r
+            else 0.0
+        )
+        lag = float(np.clip(lag, 0.0, 0.98))
+        out.append(np.sqrt(max(square, n.sigma**2) * (1 + lag) / (1 - lag)))
+    return np.array(out)
+
+
+def survivors(found: Diagnosis) -> list[Standing]:
+    """List what is not ruled out, likeliest first: hypotheses with effects, or laws of the remainder.
+
+    Where the recordings agree with the plant and yet an effect is likelier than none, the plant as it is
+    counts, too. Each has its probability and its name. The list is empty where nothing is undecided."""
+    perhaps = found.decision.verdict == "consistent" and found.posterior.something > 0.5
+    if found.decision.verdict == "ambiguous" or perhaps:
+        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+        likely = [(fits[k], p, _effects(k)) for k, p in found.posterior.hypotheses.items() if k or perhaps]
+    elif found.law:
+        likely = [
+            (f, share, described(p, f))
+            for p, f, share in ((found.law.proposal, found.law.fitted, found.law.share), *found.law.rivals)
+        ]
+    else:
+        return []
+    likely.sort(key=lambda x: -x[1])
+    return [x for x in likely if x[1] >= LIKELY * likely[0][1] and x[1] > 0][:MOST]
+
+
+def _effects(keys: Iterable[Key]) -> str:
+    return " and ".join(f"{effect} at {where}" for effect, where in sorted(keys)) or "the plant as it is"
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A simulated candidate.
+
+    Its information, the distances D (n, n) and each hypothesis's prediction."""
+
+    excitation: Excitation
+    bits: float
+    distances: np.ndarray
+    predictions: list[np.ndarray]  # readings (N, ny)
+
+    @property
+    def bits_per_second(self) -> float:
+        """Return the information by time."""
+        return self.bits / self.excitation.duration_s
+
+
+class _Comparison:
+    """The hypotheses of an undecided diagnosis, and what an experiment would tell between them."""
+
+    def __init__(self, case: Case, standing: Sequence[Standing], limits: Limits):
+        self.case, self.limits = case, limits
+        self.predictors = [_predictor(f, p, label) for f, p, label in standing]
+        weights = np.array([b.weight for b in self.predictors])
+        self.weights = weights / weights.sum()
+        self.step = float(np.median(np.concatenate([np.diff(t.t) for t in case.tables])))
+        self.sigma = noise_of(case, with_residuals(case, standing[0][0]))
+        self.outputs = list(case.null.model.outputs)
+        self.seen = [j for j, _ in enumerate(self.outputs) if len(_recorded(case, j))]
+        self.points = min(POINTS, max(READINGS // len(self.outputs), FEWEST_POINTS))
+        unknowns = sum(len(b.model.unknowns) for b in self.predictors)
+        numbers = self.points * len(self.outputs) * unknowns
+        self.trials = int(np.clip(NUMBERS / numbers, FEWEST_TRIALS, TRIALS))
+
+    def grid(self, x: Excitation) -> float:
+        """The step of a simulated experiment, s."""
+        return max(self.step, x.duration_s / self.points)
+
+    def trial(self, x: Excitation) -> _Trial | None:
+        """Simulate a candidate; None where a hypothesis cannot, or where a reading leaves its limits."""
+        table = x.table(self.case.plant, self.grid(x))
+        predictions = [p for b in self.predictors if (p := b.predict(table)) is not None]
+        if len(predictions) < len(self.predictors) or self._leaves_limits(predictions):
+            return None
+        distances = self.distances(predictions, self.sigma[self.seen] * np.sqrt(self.step / self.grid(x)))
+        return _Trial(x, bits(distances, self.weights), distances, [y for y, _ in predictions])
+
+    def distances(
+        self, predictions: Sequence[Prediction], sigma: np.ndarray, state: str | None = None
+    ) -> np.ndarray:
+        """Compute D of every two hypotheses over the recorded outputs, and over a state with a sensor."""
+        columns = []
+        for b in self.predictors:
+            recorded = [b.model.outputs.index(self.outputs[j]) for j in self.seen]
+            columns.append(recorded + ([len(b.model.outputs) + b.model.states.index(state)] if state else []))
+        return distances(predictions, columns, sigma)
+
+    def _leaves_limits(self, predictions: Sequence[Prediction]) -> bool:
+        """Whether any hypothesis predicts a reading outside its limits.
+
+        Without limits: outside the recorded range, widened only to where the rig starts from."""
+        for j, o in enumerate(self.outputs):
+            y = _recorded(self.case, j)
+            for p, _ in predictions if len(y) or o in self.limits else ():
+                if o in self.limits:
+                    low, high = self.limits[o]
+                else:
+                    low, high = min(y.min(), p[0, j]), max(y.max(), p[0, j])
+                if p[:, j].min() < low or p[:, j].max() > high:
+                    return True
+        return False
+
+
+def propose(
+    found: Diagnosis,
+    drivable: Sequence[str] = (),
+    limits: Limits = NONE,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[dict[str, Any], Excitation] | None:
+    """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
+
+    None where nothing is undecided (`survivors`) or nothing can be driven.
+    `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
+    case = found.case
+    for n in limits:
+        if n not in case.plant.inputs and n not in case.plant.outputs:
+            raise InputError(
+                f"a limit of '{n}': no such input or output of {case.plant.file}; there are "
+                + ", ".join((*case.plant.inputs, *case.plant.outputs))
+            )
+    standing = survivors(found)
+    if len(standing) < 2:
+        return None
+    drive = levers(case.plant, case.tables, drivable, limits)
+    if not drive:
+        return None
+    if progress:
+        progress("looking for the experiment that tells them apart")
+    comparison = _Comparison(case, standing, limits)
+    for share in SHARES:
+        smaller = [_smaller(lever, share) for lever in drive]
+        candidates = family(case.plant, case.tables, smaller, comparison.step)
+        candidates = candidates[:: -(-len(candidates) // comparison.trials)]
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
+        if trials:
+            most = max(t.bits for t in trials)
+            best = max((t for t in trials if t.bits >= ENOUGH * most), key=lambda t: t.bits_per_second)
+            return _entry(comparison, best, len(trials)), best.excitation
+    return None
+
+
+def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, Any]:
+    """The proposal as diagnosis.json holds it."""
+    x, (first, *others) = best.excitation, comparison.predictors
+    hours = x.duration_s / 3600
+    sigmas = np.sqrt(best.distances[0, 1:])
+    inputs = {n: c.tolist() for n, c in x.corners.items()} | {
+        n: [[0.0, v]] for n, v in x.starts.items() if n in comparison.case.plant.inputs
+    }
+    return {
+        "profile": x.title,
+        "why": f"It would set {first.label} apart from {others[int(np.argmin(sigmas))].label} by {sigmas.min():.1f} "
+        f"standard errors, after what their parameters are still uncertain by ({best.bits:.2f} bits in {hours:.3g} h; "
+        f"best per hour of {candidates} candidates).",
+        "also_helpful": None if np.all(sigmas**2 >= DECIDES) else _sensor(comparison, best),
+        "duration_s": x.duration_s,
+        "sample_s": comparison.step,
+        "hours": hours,
+        "bits": best.bits,
+        "bits_per_hour": best.bits / hours,
+        "candidates": candidates,
+        "separates": [
+            {"hypothesis": b.label, "from": first.label, "sigmas": float(q)}
+            for b, q in zip(others, sigmas, strict=True)
+        ],
+        "inputs": inputs,
+        "predicted": _predicted(comparison, best.predictions),
+        "limits": {n: list(span) for n, span in comparison.limits.items()},
+        "file": FILES[0],
+    }
+
+
+def _smaller(lever: Lever, share: float) -> Lever:
+    """The lever with its range drawn together about its rest."""
+    return dataclasses.replace(
+        lever,
+        low=lever.rest + share * (lever.low - lever.rest),
+        high=lever.rest + share * (lever.high - lever.rest),
+    )
+
+
+def _recorded(case: Case, j: int) -> np.ndarray:
+    """All readings of output number j."""
+    column = list(case.plant.outputs.values())[j].column
+    parts = [t.columns[column] for t in case.tables if column in t.columns]
+    return np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
+
+
+def _predicted(comparison: _Comparison, predictions: Sequence[np.ndarray]) -> dict[str, dict[str, Any]]:
+    """List each output's unit, predicted range over all hypotheses, and recorded range."""
+    out = {}
+    for j, o in enumerate(comparison.outputs):
+        y = _recorded(comparison.case, j)
+        out[o] = {
+            "unit": comparison.case.plant.outputs[o].unit,
+            "column": comparison.case.plant.outputs[o].column,
+            "low": float(min(p[:, j].min() for p in predictions)),
+            "high": float(max(p[:, j].max() for p in predictions)),
+            "recorded": [float(y.min()), float(y.max())] if len(y) else None,
+        }
+    return out
+
+
+def _sensor(comparison: _Comparison, best: _Trial) -> str:
+    """Where even the best experiment leaves doubt.
+
+    The stored quantity whose own sensor would tell most, in words."""
+    plant, sigma, seen = comparison.case.plant, comparison.sigma, comparison.seen
+    grid = comparison.grid(best.excitation)
+    share = np.sqrt(comparison.step / grid)
+    table = best.excitation.table(plant, grid)
+    predictions = [p for b in comparison.predictors if (p := b.predict(table, True)) is not None]
+    shown = [plant.outputs[comparison.outputs[j]] for j in seen]
+    most, where = bits(best.distances, comparison.weights) + WORTH_A_SENSOR, ""
+    for node in plant.nodes.values():
+        alike = [sigma[j] for j, o in zip(seen, shown, strict=True) if o.unit == node.unit]
+        if (
+            any(o.value.op == "name" and o.value.value == node.name for o in shown)
+            or not alike
+            or any(node.name not in b.model.states for b in comparison.predictors)
+        ):
+            continue
+        noise = np.append(sigma[seen], np.median(alike)) * share
+        told = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
+        if told > most:
+            most, where = told + WORTH_A_SENSOR, node.name
+    if where:
+        return f"A sensor of its own at {where} would tell more ({most - WORTH_A_SENSOR:.2f} bits with the same experiment)."
+    return (
+        f"No experiment of the family decides for sure between {comparison.predictors[0].label} and the others inside the "
+        "recorded limits; a larger range of the inputs or another sensor would be needed."
+    )

@@ -1,0 +1,113 @@
+"""Every entry of the catalogue at every place of a plant, and the plant with it.
+
+`candidates` lists them; `Candidate.extend` gives the plant with one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from thermoctl.diagnosis.hypothesis.builder import Builder, Placement
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.places import PLACES, askable
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.language import Plant
+from thermoctl.plant.residuals import Prior
+
+Key = tuple[str, str]  # (effect, where)
+
+
+class Candidate(Placement):
+    """A placed effect as a search sees it: its bounds, its priors, the plant with it."""
+
+    @property
+    def key(self) -> Key:
+        """Return (effect, where), as a result names it."""
+        return self.effect.name, self.place.where
+
+    @property
+    def jumps(self) -> bool:
+        """Does what a sensor reads hold inputs that go in steps?"""
+        y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
+        return y is not None and any(
+            i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y)
+        )
+
+    def beliefs(self, plant: Plant) -> list[Prior]:
+        """Return the priors of the effect's parameters in `plant`, for each recording."""
+        if self.effect.prior is None:
+            return []
+        # a parameter without a value of its own in each recording counts once
+        share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
+        out = []
+        for d in self.rig.drives:
+            known = {
+                "duration": num(float(d.t[-1] - d.t[0])),
+                "first_air": num(self.rig.first_air(d)),
+                **{
+                    p.name: name(self.own(p.name))
+                    for p in self.effect.parameters
+                    if self.own(p.name) in plant.parameters
+                },
+            }
+
+            def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
+                """Return the plant's expression for a name of the catalogue's prior."""
+                return known.get(str(e.value)) if e.op == "name" else None
+
+            out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
+        return out
+
+    def surprise(self, plant: Plant) -> float:
+        """-2 log of how likely the values are that `plant` holds for the effect, over all recordings."""
+        total = 0.0
+        for b in self.beliefs(plant):
+            total += float(
+                ex.evaluate(
+                    b.neg2_log,
+                    {
+                        n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
+                        for n in ex.names(b.neg2_log)
+                    },
+                )
+            )
+        return total
+
+    def extend(
+        self, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]] | None = None
+    ) -> Plant:
+        """Return the plant with the effect.
+
+        `values`: of its parameters, by the effect's names; a number, or one a recording."""
+        return Builder(self, values, ranges or {}).plant()
+
+
+def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
+    """Every effect at every place it can sit, with every choice of the signals it needs."""
+    out = []
+    for effect in effects.values():
+        if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
+            continue
+        for place in PLACES[effect.where](rig):
+            here = effect.at(place.exponent)
+            if here is None or not askable(rig, place):
+                continue
+            near = place.nodes.get("v")
+            choices: list[dict[str, Expr]] = [{}]
+            for need in effect.needs:
+                if need in place.symbols:
+                    continue
+                found = rig.signals(need, near)
+                if need == "T" and effect.where == "displacement":
+                    found = sorted(ex.names(place.symbols["y"]) & set(found)) or found
+                choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
+            for variant in range(len(effect.changes)):
+                for k, choice in enumerate(choices):
+                    candidate = Candidate(here, place, rig, variant, choice, f"{variant}{k}")
+                    if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
+                        continue  # it goes on straight lines in any case
+                    out.append(candidate)
+    return out

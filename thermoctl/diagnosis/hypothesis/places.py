@@ -1,0 +1,301 @@
+"""The places of a plant at which an entry of the catalogue can sit, by the kind that the entry names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.language import Flow, Plant
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect sits, by the name that a result gives, and what its symbols stand for there."""
+
+    where: str
+    symbols: Mapping[str, Expr] = field(default_factory=dict)
+    nodes: Mapping[str, str] = field(default_factory=dict)  # T, v, a, b ... as ends of flows
+    flow: str | None = None
+    output: str | None = None
+    input: str | None = None
+    exponent: float | None = None  # of an outlet, as the plant file has it
+
+    def parts(self) -> set[str]:
+        """The nodes and the flow that it names (not those that a reading is made of)."""
+        named = {str(e.value) for s, e in self.symbols.items() if s != "y" and e.op == "name"}
+        return {*self.nodes.values(), *named} | ({self.flow} if self.flow else set())
+
+
+def _nodes(rig: Rig, which: Sequence[str], symbol: str) -> Iterator[Place]:
+    for n in which:
+        yield Place(n, {symbol: name(n)}, {symbol: n})
+
+
+def _temperature_nodes(rig: Rig) -> Iterator[Place]:
+    if rig.air:
+        yield from _nodes(rig, rig.temperatures, "T")
+
+
+def _velocity_nodes(rig: Rig) -> Iterator[Place]:
+    yield from _nodes(rig, rig.velocities, "v")
+
+
+def _storing(rig: Rig) -> list[str]:
+    """The nodes that a flow can fill; a position stores nothing."""
+    ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
+    return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
+
+
+def _exchanging(rig: Rig) -> Iterator[Place]:
+    nodes = set(_storing(rig))
+    for f in rig.physics.flows.values():
+        if f.source in nodes and f.target in nodes:
+            ends = {"m": str(f.source), "n": str(f.target)}
+            yield Place(f"{f.source}-{f.target}", {k: name(v) for k, v in ends.items()}, ends)
+
+
+def _conductances(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        read = ex.names(f.rate)
+        ends = [e for e in (f.source, f.target) if e in rig.temperatures]
+        if ends and read & set(rig.temperatures):
+            hot = next(e for e in ends if e in read) if any(e in read for e in ends) else ends[0]
+            yield Place(f.name, {"T": name(hot)}, flow=f.name)
+
+
+def _pairs(rig: Rig) -> Iterator[Place]:
+    linked = {frozenset((f.source, f.target)) for f in rig.physics.flows.values()}
+    for k, a in enumerate(rig.temperatures):
+        for b in rig.temperatures[k + 1 :]:
+            if frozenset((a, b)) not in linked:
+                yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"TA": a, "TB": b})
+
+
+def _heated_pairs(rig: Rig) -> Iterator[Place]:
+    for a in rig.temperatures:
+        if not heats(rig.physics, a, rig):
+            continue
+        for b in rig.temperatures:
+            if a != b:
+                yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"a": a, "b": b})
+
+
+def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
+    """Return the flows of heat from outside into a node that follow inputs, not temperatures of the network.
+
+    Temperatures may change such a flow (copper's resistance), but it is zero while the inputs rest."""
+    return [
+        f
+        for f in plant.flows.values()
+        if f.target == node
+        and f.source is None
+        and not ex.calls_fmu(f.rate)
+        and ex.names(f.rate) & rig.moving_inputs
+        and not ex.names(f.rate) & set(rig.heat_inputs)
+        and (node not in ex.names(f.rate) or _rests(plant, f))
+    ]
+
+
+def _rests(plant: Plant, f: Flow) -> bool:
+    """Is a flow nothing while all inputs are zero, whatever the temperatures?"""
+    if any(e.op == "delay" for e in ex.walk(f.rate)):
+        return False
+    at = {
+        **{p.name: p.value for p in plant.parameters.values()},
+        **dict.fromkeys(plant.inputs, 0.0),
+        "t": 0.0,
+    }
+    return all(float(ex.evaluate(f.rate, {**at, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0))
+
+
+def _joule_flows(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        squares = [
+            e
+            for e in ex.walk(f.rate)
+            if (e.op == "**" and e.args[1].op == "num" and e.args[1].value == 2)
+            or (e.op == "*" and e.args[0] is e.args[1])
+        ]
+        if f.target in rig.temperatures and f.source is None and squares and f.target not in ex.names(f.rate):
+            yield Place(f.name, {"T": name(f.target)}, flow=f.name)
+
+
+def _motors(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        if rig.is_motor(f):
+            yield Place(f.name, {}, {"v": f.target or f.source or ""}, flow=f.name)
+
+
+def driven(rig: Rig) -> Iterator[Place]:
+    """Yield each input that drives a motor or a pump by its flow; by its own name where that is an FMU's."""
+    for f in rig.physics.flows.values():
+        if rig.is_motor(f) or rig.is_pump(f):
+            for u in rig.drives_of(f):
+                yield Place(u if ex.calls_fmu(f.rate) else f.name, {"u": name(u)}, flow=f.name, input=u)
+
+
+def askable(rig: Rig, place: Place) -> bool:
+    """Return whether the plant shows what an effect at the place would change.
+
+    The rate of an FMU is a body's whole balance, not one flow: only an input in it can be changed."""
+    return place.input is not None or not place.flow or not ex.calls_fmu(rig.physics.flows[place.flow].rate)
+
+
+def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
+    for o in rig.physics.outputs.values():
+        if dimension is None or rig.kind(o) == dimension:
+            yield Place(o.name, {"y": o.value}, output=o.name)
+    used = [*(f.rate for f in rig.plant.flows.values()), *(o.value for o in rig.plant.outputs.values())]
+    read = set().union(*map(ex.names, used))
+    for i in rig.physics.inputs.values():
+        if i.name in rig.moving_inputs & read and (dimension is None or rig.kind(i) == dimension):
+            yield Place(i.name, {"y": name(i.name)}, input=i.name)
+
+
+def _of_bodies(rig: Rig) -> Iterator[Place]:
+    yield from (p for p in _sensors(rig) if p.where != rig.air)
+
+
+def _passive(rig: Rig) -> Iterator[Place]:
+    """Sensors, without the inputs that drive: a late or clipped drive is the actuator's entry."""
+    driving = {p.input for p in driven(rig)}
+    yield from (p for p in _sensors(rig) if not p.input or p.input not in driving)
+
+
+def _in_moving_air(rig: Rig) -> Iterator[Place]:
+    if rig.air in rig.moving_inputs:
+        for p in (*_sensors(rig, "temperature"), *_displacements(rig)):
+            if p.where != rig.air:
+                yield p
+
+
+def _displacements(rig: Rig) -> Iterator[Place]:
+    warm = set(rig.temperatures) | set(rig.heat_inputs)
+    for o in rig.physics.outputs.values():
+        if rig.kind(o) == "length" and ex.names(o.value) & warm:
+            yield Place(o.name, {"y": o.value}, output=o.name)
+
+
+def _members(rig: Rig) -> Iterator[Place]:
+    for at in _displacements(rig):
+        for T in rig.signals("T"):
+            yield Place(T, {**at.symbols, "T": name(T)}, output=at.output)
+
+
+def _bending_pairs(rig: Rig) -> Iterator[Place]:
+    for at in _displacements(rig):
+        T = rig.signals("T")
+        for k, a in enumerate(T):
+            for b in T[k + 1 :]:
+                yield Place(f"{a}-{b}", {**at.symbols, "TA": name(a), "TB": name(b)}, output=at.output)
+
+
+def _voltages(rig: Rig) -> Iterator[Place]:
+    for o in rig.physics.outputs.values():
+        if rig.kind(o) == "voltage" and not any(_sources(rig, n) for n in ex.names(o.value)):
+            yield Place(o.name, {"y": o.value}, output=o.name)
+    for n in rig.physics.nodes.values():
+        if rig.kind(n) == "current":
+            yield Place(n.name, {}, {"a": n.name})
+
+
+def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
+    """Return the part of an outflow that follows its vessel's level, the head in it, and its exponent."""
+    node = rig.physics.nodes.get(f.source or "")
+    if node is None or node.name in (*rig.temperatures, *rig.velocities, *rig.position_of.values()):
+        return None
+    known = {p.name: p.value for p in rig.physics.parameters.values()}
+    for e in ex.walk(f.rate):
+        if e.op == "sqrt" and node.name in ex.names(e):
+            return e, e.args[0], 0.5
+        if e.op == "**" and node.name in ex.names(e.args[0]) and ex.names(e.args[1]) <= known.keys():
+            return e, e.args[0], float(ex.evaluate(e.args[1], known))
+    head = f.rate
+    while head.op in ("*", "/"):
+        factors = [a for a in head.args if node.name in ex.names(a)]
+        if len(factors) != 1 or (head.op == "/" and factors[0] is not head.args[0]):
+            return None
+        head = factors[0]
+    # Only a unit tells a level whose outlet is taken as laminar from any other state that decays.
+    if rig.kind(node) not in ("length", "volume") or ex.names(head) & rig.physics.nodes.keys() != {node.name}:
+        return None
+    return head, head if head.op == "max" else ex.make("max", head, ex.num(0.0)), 1.0
+
+
+def _sources(rig: Rig, node: str) -> bool:
+    return any(f.source == node and outlet(rig, f) for f in rig.physics.flows.values())
+
+
+def _levels(rig: Rig) -> Iterator[Place]:
+    for n in rig.physics.nodes:
+        if _sources(rig, n):
+            after = next((f.target for f in rig.physics.flows.values() if f.source == n and f.target), None)
+            yield Place(n, {"a": name(n)}, {"a": n, **({"b": after} if after else {})})
+
+
+def _orifices(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        if found := outlet(rig, f):
+            yield Place(f.name, flow=f.name, exponent=found[2])
+
+
+def _resistive(rig: Rig) -> Iterator[Place]:
+    ohms = {q for q, p in rig.physics.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
+    for o in rig.physics.outputs.values():
+        if ex.names(o.value) & ohms:
+            yield Place(o.name, {}, output=o.name)
+    for f in rig.physics.flows.values():
+        if ex.names(f.rate) & ohms and f.target not in rig.temperatures:
+            yield Place(f.name, {}, flow=f.name)
+
+
+def _free(rig: Rig, e: Expr) -> bool:
+    parameters = rig.physics.parameters
+    return any(parameters[n].range for n in ex.names(e) & parameters.keys())
+
+
+def _fixed_nodes(rig: Rig) -> Iterator[Place]:
+    """Yield nodes whose storage a refit cannot move. A storage of 1 is a definition: dn/dt = sum of flows."""
+    storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
+    yield from _nodes(rig, [n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)], "T")
+
+
+def _fixed_flows(rig: Rig) -> Iterator[Place]:
+    """Flows that follow their own node, and whose size a refit cannot move."""
+    for f in rig.physics.flows.values():
+        ends = {e for e in (f.source, f.target) if e}
+        if ends & ex.names(f.rate) & set(_storing(rig)) and not _free(rig, f.rate):
+            yield Place(f.name, {}, flow=f.name)
+
+
+ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")  # places of errors of a reading
+PLACES = {
+    "node": lambda rig: _nodes(rig, _storing(rig), "n"),
+    "node_pair": _exchanging,
+    "temperature_node": _temperature_nodes,
+    "velocity_node": _velocity_nodes,
+    "conductance": _conductances,
+    "temperature_pair": _pairs,
+    "heated_pair": _heated_pairs,
+    "joule_flow": _joule_flows,
+    "motor": _motors,
+    "drive": driven,
+    "sensor": _sensors,
+    "body_sensor": _of_bodies,
+    "passive_sensor": _passive,
+    "reading_in_air": _in_moving_air,
+    "position_sensor": lambda rig: _sensors(rig, "length"),
+    "displacement": _displacements,
+    "member": _members,
+    "bending_pair": _bending_pairs,
+    "voltage_sensor": _voltages,
+    "level_node": _levels,
+    "orifice": _orifices,
+    "resistive": _resistive,
+    "fixed_node": _fixed_nodes,
+    "fixed_flow": _fixed_flows,
+}

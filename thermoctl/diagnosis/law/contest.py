@@ -1,0 +1,98 @@
+"""Unknown laws as hypotheses beside those of the catalogue: one search, one evidence, one table of odds.
+
+A law is proposed from the residual of a hypothesis (`propose`), refitted, and extended by effects of the
+catalogue like any other. Its prior odds are those of an effect that is rare, less the cost of the choice
+among places, signals and forms (`Proposal.cost`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import softmax
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.levels import only_noise
+from thermoctl.diagnosis.evidence.posterior import Hypothesis
+from thermoctl.diagnosis.law.find import refits
+from thermoctl.diagnosis.law.forms import LAW
+from thermoctl.diagnosis.law.propose import Proposal, propose_laws
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.plant.simulate import SimulationError
+
+
+def with_laws(
+    case: Case, found: Searched, limits: Limits, say: Callable[[str], None] = lambda text: None
+) -> Searched:
+    """Return a search with laws beside the plant alone, and beside the leading hypothesis.
+
+    A plant that leaves only noise needs none. Nor does one effect that leaves only noise: a law is rarer than
+    it, and cannot fit better."""
+    best = found.tried[0].fitted
+    if len(best.hypothesis.effects) <= 1 and only_noise(case, best, limits):
+        return found
+    tried = {w.fitted.hypothesis.keys: w for w in found.tried}
+    s = Search(case, limits, found.where, tried, set(found.seen), list(found.norms))
+    s.promised, s.refused = dict(found.promised), dict(found.refused)
+    s.refitted = {*tried, *s.refused}
+    for parent in (s.tried[frozenset()], s.best):
+        if case.budget.stopped() or only_noise(case, parent.fitted, limits):
+            continue
+        if len(parent.fitted.hypothesis.effects) >= limits.effects:
+            continue
+        say("looking for a law")
+        laws = _laws(case, parent, s.best.score, limits, say)
+        s.keep(laws)
+        if s.best in laws:
+            grow(s)
+            swap(s)
+    return searched(s)
+
+
+def _laws(
+    case: Case, parent: Weighed, ahead: float, limits: Limits, say: Callable[[str], None]
+) -> list[Weighed]:
+    """Return a hypothesis with the best law at each place.
+
+    Only laws that may come near the score `ahead` are refitted. Sums of terms follow if one term is ahead."""
+    try:
+        proposals, _ = propose_laws(case, parent.fitted, limits.rare)
+    except (SimulationError, np.linalg.LinAlgError):
+        return []
+    taken = {key[1] for key in parent.fitted.hypothesis.keys if key[0] == LAW}
+    proposals = [p for p in proposals if p.place.where not in taken]
+    term = float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
+
+    def cost(p: Proposal) -> float:
+        """Return minus the log prior odds of a law: each term is a piece of physics that nobody named."""
+        return p.cost - term * len(p.terms)
+
+    found: list[tuple[Proposal, Weighed]] = []
+    for alone in (True, False):
+        some = [p for p in proposals if (len(p.terms) == 1) is alone]
+        tried = refits(case, parent.fitted, some, cost, ahead - BEATEN - parent.score, say)
+        found += [(p, Weighed(f, parent.log_odds - cost(p))) for p, f in tried]
+        if max((w.score for _, w in found), default=-np.inf) < ahead:
+            break
+    return [
+        _best([x for x in found if x[0].place == place], limits) for place in {p.place: 0 for p, _ in found}
+    ]
+
+
+def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Limits) -> Weighed:
+    """Return the likeliest of the laws at one place; with others that fit about as well."""
+    share = softmax(np.array([w.score for _, w in found]) / limits.temperature)
+    order = np.argsort(-share, kind="stable")
+    best = found[order[0]][1]
+    kinds = {found[order[0]][0].kind}
+    rivals: list[tuple[Proposal, Fitted, float]] = []
+    for k in order[1:]:
+        if share[k] > 1 - limits.set and found[k][0].kind not in kinds:
+            kinds.add(found[k][0].kind)
+            rivals.append((found[k][0], found[k][1].fitted, float(share[k])))
+    *effects, law = best.fitted.hypothesis.effects
+    hypothesis = Hypothesis((*effects, replace(law, rivals=tuple(rivals))))
+    return replace(best, fitted=replace(best.fitted, hypothesis=hypothesis))

@@ -1,0 +1,53 @@
+"""The flow of the remainder as a free function of a signal, beside its law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoctl.diagnosis.law.propose import PIECES, Proposal, pieces
+from thermoctl.diagnosis.law.signals import Signal
+from thermoctl.diagnosis.law.smooth import Tracked
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+
+SEEN = 0.01  # of the strongest direction of a free function: weaker ones are not drawn
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The remainder's flow over a signal without any form, its sd, and the law, at visited points."""
+
+    signal: Signal
+    at: np.ndarray
+    flow: np.ndarray
+    sd: np.ndarray
+    law: np.ndarray
+
+
+def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
+    """Return the flow at the law's place as a free function of its first signal, and the law there.
+
+    None for a law with a memory, or in a storage. The free function is the law plus a fit of its residual."""
+    found = [s for t in p.terms for s in t.signals]
+    if not found or p.place.part != "flow" or any(t.form.memory for t in p.terms):
+        return None
+    s = found[0]
+    known = {q: v.value for q, v in plant.parameters.items()}
+    values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+    flows = [
+        np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **known}), float), d.t.shape)
+        for run, d in zip(at.runs, at.metric.drives, strict=True)
+    ]
+    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES + 4)))
+    parts = [pieces(v, knots) for v in values]
+    whole = np.concatenate(parts)
+    line = np.linalg.lstsq(whole, np.concatenate(flows), rcond=None)[0]
+    rest = at.target - at.columns(p.place, [q[:, None] for q in flows])[:, 0]
+    u, w, v = np.linalg.svd(at.columns(p.place, parts), full_matrices=False)
+    seen = w > SEEN * w[0]  # the rest is the plant's own
+    noise = max(float(np.mean(rest**2)), 1.0)
+    extra = v[seen].T @ ((u.T @ rest)[seen] / w[seen])
+    sd = np.sqrt(noise * ((v[seen].T / w[seen]) ** 2).sum(axis=1))
+    return Curve(s, knots, line + extra, sd, line)

@@ -1,0 +1,121 @@
+"""The law of a diagnosis, and the refits of proposed laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.law.curve import Curve, curve
+from thermoctl.diagnosis.law.propose import Proposal
+from thermoctl.diagnosis.law.refit import (
+    SIMPLER,
+    PlacedLaw,
+    affordable,
+    at_bound,
+    law_of,
+    law_rate,
+    refitted_law,
+    simpler_law,
+)
+from thermoctl.diagnosis.law.smooth import law_unit, tracked
+from thermoctl.diagnosis.search.shortlist import HALF
+from thermoctl.plant import expression as ex
+from thermoctl.plant.cores import LEAST, batches, each
+
+Tried = tuple[Proposal, Fitted]
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law that a diagnosis found.
+
+    - `fitted`: the hypothesis with it, and perhaps with effects of the catalogue
+    - `gain`: log posterior odds against the best hypothesis without it
+    - `probability`: that something at its place follows its signals
+    - `confirmed`: that it predicts what it was not fitted to (confirm.py)"""
+
+    placed: PlacedLaw
+    fitted: Fitted
+    gain: float
+    probability: float
+    confirmed: float
+    curve: Curve | None
+    unit: str | None
+
+    @property
+    def proposal(self) -> Proposal:
+        """Its place and terms."""
+        return self.placed.proposal
+
+    @property
+    def rivals(self) -> tuple[tuple[Proposal, Fitted, float], ...]:
+        """Other laws at its place, with their probability among these."""
+        return self.placed.rivals
+
+    @property
+    def share(self) -> float:
+        """Its probability among the laws that fit about as well."""
+        return 1.0 - sum(share for _, _, share in self.rivals)
+
+    @property
+    def rate(self) -> ex.Expr:
+        """Return the law's flow, or the storage with it."""
+        return law_rate(self.fitted)
+
+
+def found_law(
+    case: Case, f: Fitted, parent: Fitted, gain: float, probability: float, confirmed: float
+) -> Law | None:
+    """Return the law of a hypothesis, None where it has none. `parent`: the hypothesis without it."""
+    law = law_of(f)
+    if law is None:
+        return None
+    p = law.proposal
+    drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f), f.plant)
+    return Law(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
+
+
+def refits(
+    case: Case,
+    parent: Fitted,
+    proposals: Sequence[Proposal],
+    cost: Callable[[Proposal], float],
+    least: float,
+    say: Callable[[str], None],
+) -> list[Tried]:
+    """Refit the proposals, and sums without their least significant term, while more may gain than so far.
+
+    `cost`: minus the log prior odds of a law; `least`: log posterior odds below which none is of use.
+    Promises are of first order: all are taken for too small by the largest `ratio` so far."""
+    tried: list[Tried] = []
+    queue, more = list(proposals), SIMPLER
+    gain, ratio, leader, left = max(least, 0.0), 1.0, parent, affordable(case, parent)
+
+    def wanted(p: Proposal) -> bool:
+        """Return whether a law may still win, and a refit is left for it."""
+        nonlocal left
+        if not left or case.budget.stopped() or cost(p) + gain > HALF * ratio * p.promise:
+            return False
+        left -= 1
+        return True
+
+    for batch, rest in batches(queue, wanted):
+        say(f"looking for a law: refit {len(queue) - rest} of {len(queue)} at most")
+        fits = each(partial(refitted_law, case, parent, leader=leader), batch, LEAST * len(batch))
+        for p, f in zip(batch, fits, strict=True):
+            if f is None:
+                continue
+            more_evidence = f.log_evidence - parent.log_evidence
+            gain, ratio = max(gain, more_evidence - cost(p)), max(ratio, more_evidence / max(p.promise, 1.0))
+            leader = max(leader, f, key=lambda x: x.log_likelihood)
+            if not f.absent and not at_bound(f):
+                tried.append((p, f))
+            if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
+                simpler = simpler_law(p, f)
+                if simpler.kind not in {q.kind for q in queue}:
+                    queue.append(simpler)
+                    more -= 1
+    return tried

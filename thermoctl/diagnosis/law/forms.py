@@ -1,0 +1,286 @@
+"""The library of laws: forms (config/laws.yaml) over signals at a place, written in the plant language.
+
+A term is one form over one or two signals. A signal is divided by its typical size Z, a known parameter
+with the signal's unit. So the size A of a term has the unit of the flow."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from thermoctl import yamlfile
+from thermoctl.diagnosis.hypothesis.catalogue import Effect, EffectParameter
+from thermoctl.diagnosis.law.memory import MEMORIES
+from thermoctl.diagnosis.law.signals import Place, Signal, Values
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name, num
+from thermoctl.shipped import shipped
+
+LAW = "law"  # name of a law among the effects of a hypothesis
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A parameter of a form beside its size: values to try first, range, unit.
+
+    `of` 'duration': the values are shares of the longest run; 'visited': quantiles of the signal."""
+
+    values: tuple[float, ...]
+    range: tuple[float, float]
+    unit: str | None = None
+    of: str | None = None
+
+    def scaled(self, values: Sequence[float], s: Signal | None, duration: float) -> tuple[float, ...]:
+        """Return values, or bounds, as the form counts them."""
+        if self.of == "duration":
+            return tuple(v * duration for v in values)
+        if self.of == "visited" and s:
+            return tuple(np.interp(values, np.linspace(0, 1, len(s.visited)), s.visited).tolist())
+        return tuple(values)
+
+
+@dataclass(frozen=True)
+class Form:
+    """One form of the library."""
+
+    name: str
+    text: Expr
+    of: str
+    sizes: tuple[str, ...]
+    shapes: Mapping[str, Shape]
+    memory: str | None
+    odd: bool  # reverses with its signal
+
+
+@cache
+def library() -> tuple[Form, ...]:
+    """Return the forms of config/laws.yaml. Raises InputError."""
+    root, out = yamlfile.load(shipped("config") / "laws.yaml"), []
+    for key, node in root.value.items():
+        p: dict[str, Any] = node.plain()
+        try:
+            text = ex.parse(p["text"])
+        except ex.ExpressionError as e:
+            raise node.error(str(e)) from None
+        shapes = {
+            k: Shape(
+                tuple(map(float, s["values"])),
+                (float(s["range"][0]), float(s["range"][1])),
+                s.get("unit"),
+                s.get("of"),
+            )
+            for k, s in p.get("shapes", {}).items()
+        }
+        out.append(
+            Form(
+                key,
+                text,
+                p.get("of", "any"),
+                tuple(p.get("sizes", ("A",))),
+                shapes,
+                p.get("memory"),
+                p.get("odd", False),
+            )
+        )
+    return tuple(out)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A form over signals at values of its shapes. `number` keeps the parameters of several terms apart."""
+
+    form: Form
+    signals: tuple[Signal, ...]
+    shapes: Mapping[str, float] = field(default_factory=dict)
+    duration: float = 1.0  # of the longest run, s
+    sample: float = 1.0  # interval between samples, s
+
+    @property
+    def variables(self) -> frozenset[str]:
+        """The signals that it depends on."""
+        return frozenset(s.label for s in self.signals)
+
+    @property
+    def reverses(self) -> bool | None:
+        """Return whether the term reverses with what drives the flow; None where nothing demands it."""
+        return self.form.odd if len(self.signals) == 1 and self.signals[0].drives else None
+
+    def expression(self, number: int) -> Expr:
+        """Return the term with its parameters A, n, ... named A1, n1, ... and its signals filled in."""
+        own = {
+            q: name(f"{q}{number}")
+            for q in (*self.form.sizes, *self.form.shapes, *(("m",) if self.form.memory else ()))
+        }
+        symbols = dict(own)
+        for k, (symbol, s) in enumerate(zip("zw", self.signals, strict=False)):
+            symbols[symbol] = self.normal(s, f"{'ZW'[k]}{number}")
+            if s.kelvin is not None and symbol == "z":
+                symbols["T"] = ex.add(s.value, num(s.kelvin))
+        return ex.substitute(self.form.text, lambda e: symbols.get(str(e.value)) if e.op == "name" else None)
+
+    @staticmethod
+    def normal(s: Signal, scale: str) -> Expr:
+        """Return a signal without unit: (value - centre) / scale."""
+        value = ex.add(s.value, num(-s.centre)) if s.centre else s.value
+        return ex.div(value, name(scale))
+
+    def scales(self, number: int) -> dict[str, Signal]:
+        """Return the known parameters Z1, W1 that hold the signals' typical sizes."""
+        used = ex.names(self.expression(number)) | (
+            ex.names(self.lagged(number)) if self.form.memory else set()
+        )
+        return {f"{'ZW'[k]}{number}": s for k, s in enumerate(self.signals) if f"{'ZW'[k]}{number}" in used}
+
+    def lagged(self, number: int) -> Expr:
+        """Return what drives the memory of the term."""
+        return self.normal(self.signals[0], f"Z{number}")
+
+    def filling(self, number: int) -> Expr:
+        """Return the rate of the memory."""
+        known = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
+        known |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
+        text = ex.parse(MEMORIES[self.form.memory or ""].rate)
+        return ex.substitute(text, lambda e: known.get(str(e.value)) if e.op == "name" else None)
+
+    def memory_text(self, number: int) -> str:
+        """Return the memory of the term in words."""
+        known = {k: f"{k}{number}" for k in self.form.shapes} | {k: f"{v:.4g}" for k, v in self.clock.items()}
+        return MEMORIES[self.form.memory or ""].words.format(z=readable(self.lagged(number)), **known)
+
+    @property
+    def clock(self) -> dict[str, float]:
+        """Return the times that a memory may count in, s."""
+        return {"duration": self.duration, "sample": self.sample}
+
+    def values(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return the term (N, sizes) along a trajectory, for sizes of one."""
+        shapes = {q: np.array([v]) for q, v in self.shapes.items()}
+        return Family(self.form, self.signals, shapes, self.duration, self.sample).values(run, t)
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """A form over signals, at k values of each of its shapes (k,)."""
+
+    form: Form
+    signals: tuple[Signal, ...]
+    shapes: Mapping[str, np.ndarray]
+    duration: float
+    sample: float
+
+    @property
+    def count(self) -> int:
+        """Number of terms."""
+        return len(next(iter(self.shapes.values()), (0,)))
+
+    def term(self, k: int) -> Term:
+        """Return the term with the k-th values."""
+        shapes = {q: float(v[k]) for q, v in self.shapes.items()}
+        return Term(self.form, self.signals, shapes, self.duration, self.sample)
+
+    def values(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return the terms (N, count * sizes) along a trajectory, for sizes of one."""
+        known: dict[str, Any] = {**self.shapes, "pi": np.pi}
+        for symbol, s in zip("zw", self.signals, strict=False):
+            value = s.along(run, t)
+            known[symbol] = ((value - s.centre) / s.size)[:, None]
+            if symbol == "z" and s.kelvin is not None:
+                known["T"] = (value + s.kelvin)[:, None]
+        if self.form.memory:
+            known["m"] = MEMORIES[self.form.memory].along(t, known["z"][:, 0], self.shapes, self.duration)
+        out = np.empty((len(t), self.count, len(self.form.sizes)))
+        for k, q in enumerate(self.form.sizes):
+            one = {o: float(o == q) for o in self.form.sizes}
+            with np.errstate(all="ignore"):
+                out[:, :, k] = ex.evaluate(self.form.text, {**known, **one})
+        return out.reshape(len(t), -1)
+
+
+def families(
+    found: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
+) -> list[Family]:
+    """Return every form at its first values over the signals found. `every`: possible second signals."""
+    out = []
+    for form in library():
+        if form.of == "none":
+            out.append(Family(form, (), {}, duration, sample))
+            continue
+        for z in found:
+            fits = {"absolute": z.kelvin is not None, "position": z.position, "input": z.recorded}
+            if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
+                shapes = _grid(form, z, duration)
+                out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
+    return [f for f in out if f.count]  # a signal of one value has no two thresholds
+
+
+def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
+    """Return the signals of a form whose first one is z."""
+    if form.of not in ("two", "driven"):
+        return [(z,)]
+    second = [w for w in every if w != z and not w.daily and (w.drives or form.of == "two")]
+    return [(z, w) for w in second if form.name != "product" or z.label < w.label]
+
+
+def _grid(form: Form, z: Signal, duration: float) -> dict[str, np.ndarray]:
+    """Return all combinations of the first values of the shapes."""
+    return combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
+
+
+def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
+    """Return all combinations of values, for each name (k,); two equal thresholds are none."""
+    if not values:
+        return {}
+    chosen = [v for v in itertools.product(*values.values()) if len(v) == len(set(v))]
+    return dict(zip(values, np.reshape(chosen, (-1, len(values))).T, strict=True))
+
+
+def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
+    """Return the entry of a law at a place, as the catalogue would hold it."""
+    changes: list[dict[str, Any]] = []
+    parameters: list[EffectParameter] = []
+    rate: Expr = ex.ZERO
+    for k, term in enumerate(law, 1):
+        rate = ex.add(rate, term.expression(k))
+        parameters += [_parameter(f"{q}{k}", unit, ex.parse("s"), 0.0) for q in term.form.sizes]
+        parameters += [
+            _parameter(f"{q}{k}", s.unit, None, term.shapes[q]) for q, s in term.form.shapes.items()
+        ]
+        parameters += [_parameter(q, s.unit, None, s.size) for q, s in term.scales(k).items()]
+        if term.form.memory:
+            memory = MEMORIES[term.form.memory]
+            node = {"name": f"m{k}", "storage": 1, "initial": memory.start}
+            changes.append({"node": {**node, "initial_sigma": memory.start_sigma}})
+            changes.append({"flow": {"into": f"m{k}", "rate": str(term.filling(k))}})
+    if place.part == "storage":
+        changes.append({"storage": str(ex.add(name("storage"), rate))})
+    else:
+        ends = {"into": "target", **({"from": "source"} if place.source else {})}
+        changes.append({"flow": {**ends, "rate": str(rate)}})
+    return Effect(
+        LAW,
+        "A law that the recordings propose",
+        "",
+        (),
+        (tuple(changes),),
+        {},
+        tuple(parameters),
+        ((1.0,),),
+        "",
+        (),
+        "",
+    )
+
+
+def _parameter(label: str, unit: str | None, trial: Expr | None, null: float) -> EffectParameter:
+    return EffectParameter(label, unit, -np.inf, np.inf, null, trial, None, False, None, None)
+
+
+def readable(e: Expr) -> str:
+    """Return an expression as text without the guard of a power."""
+    return re.sub(r"max\((abs\((?:[^()]|\([^()]*\))*\)), 1e-0?6\)", r"\1", str(e))

@@ -1,0 +1,332 @@
+"""Proposals of laws: sparse regression on the linearised plant.
+
+1. `smooth` tracks the recordings with unknown flows and linearises the plant about this trajectory.
+2. Each place and signal is scored with a free function of the signal (straight lines between quantiles).
+3. Where that score is high, the library's forms are tried: alone, in pairs, and in sums of three terms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.unknown import located, reached
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
+from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
+from thermoctl.diagnosis.law.smooth import Tracked, tracked
+from thermoctl.diagnosis.search.shortlist import ALIKE
+from thermoctl.plant.residuals import HUGE
+
+PIECES = 8  # of a free function of a signal
+TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
+NODES = 4  # of a plant, at which a free flow in time explains most
+SECOND = 10  # signals of a place that may be the second one of a form
+RANKED, COMBINATIONS = 40, 12  # places and signals with the best free function; whose forms are tried
+SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are rounding errors
+POOL = 60  # terms that a sum of terms is built from
+PAIRED = 600  # terms that are tried two at a time
+PAIRS, LIKELY = 24, 50_000  # pairs that explain most energy; best pairs of values that they are looked for in
+GROWN = 8  # pairs of the best score, from which sums of three grow
+PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
+TERMS = 3
+ZOOMS, FINE = 2, 9  # finer grids of the shapes of a term; values of each shape there
+CHUNK = 256  # terms whose responses are computed at a time
+KEPT = 20  # values of the shapes of a form over a signal, from which sums may grow
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Terms at a place, their sizes and the gain in log likelihood that the linearised plant promises."""
+
+    place: Place
+    terms: tuple[Term, ...]
+    sizes: tuple[float, ...]
+    promise: float
+    look: float  # log of the number of places, signals and forms that a term was chosen from
+    rare: float  # share of the terms that do not reverse with what drives the flow
+
+    @property
+    def cost(self) -> float:
+        """Return minus the log of its prior odds.
+
+        It is one of many laws; a second signal is chosen once more. A flow that a difference or a velocity
+        drives reverses with it: terms that do not share the odds `rare`."""
+        chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
+        return chosen + float(np.log(2)) * self.shapes + sum(self._surprise(t) for t in self.terms)
+
+    def _surprise(self, t: Term) -> float:
+        """Return minus the log of a form's odds over equal odds of all forms."""
+        if t.reverses is None:
+            return 0.0
+        odd = sum(form.odd for form in library()) / len(library())
+        return float(np.log(odd / (1 - self.rare)) if t.reverses else np.log((1 - odd) / self.rare))
+
+    @property
+    def kind(self) -> tuple[Place, tuple[tuple[str, tuple[Signal, ...]], ...]]:
+        """Return place, forms and signals, without the values of shapes."""
+        return self.place, tuple(sorted(((t.form.name, t.signals) for t in self.terms), key=str))
+
+    @property
+    def shapes(self) -> int:
+        """Number of parameters beside the sizes."""
+        return sum(len(t.form.shapes) for t in self.terms)
+
+    @property
+    def score(self) -> float:
+        """Promised gain less the cost of the description."""
+        return self.promise - self.cost
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A term at a place: its gain in energy, and its responses (rows, sizes)."""
+
+    gain: float
+    place: Place
+    term: Term
+    columns: np.ndarray
+
+    @property
+    def kind(self) -> tuple[str, tuple[Signal, ...]]:
+        """Return the term without the values of its shapes."""
+        return self.term.form.name, self.term.signals
+
+
+def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal], Tracked]:
+    """Return the most promising laws, best first, and the linearised plant. Raises SimulationError.
+
+    `rare`: of `Proposal`."""
+    drives = case.drives(parent.rough.model)
+    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
+    where = places(rig)
+    nodes = [p.target for p in where if p == Place(p.target)]
+    if len(nodes) > TRACKED:
+        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
+    at = tracked(case, parent, nodes)
+    likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
+    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
+    free = _ranked(at, combos)
+    chosen = free[:COMBINATIONS]
+    pool: list[Found] = []
+    for place in dict.fromkeys(p for _, p, _ in chosen):
+        found = [s for _, p, s in chosen if p == place]
+        every = [s for _, p, s in free if p == place][:SECOND]
+        pool += _singles(at, place, found, every)
+    pool.sort(key=lambda f: -f.gain)
+    pool = sorted([*pool, *(_zoomed(at, f) for f in _varied(pool))], key=lambda f: -f.gain)
+    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
+    out = [_proposal(at, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
+    for place in dict.fromkeys(f.place for f in pool):
+        out += _sums(at, place, [f for f in pool if f.place == place], base)
+    out.sort(key=lambda p: -p.score)
+    return _mixed(out), at
+
+
+def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
+    """Return the promised gain of a free function of a signal at a place, the best first.
+
+    Each piece costs half a log of the rows. Only the RANKED with the largest gain in energy are returned: the
+    gain in likelihood takes longer."""
+    found = []
+    for place, s in combos:
+        values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
+        x = at.columns(place, [pieces(v, knots) for v in values])
+        found.append((_energy(x, at.target), place, s, x))
+    found.sort(key=lambda f: -f[0])
+    out = [
+        (_promise(at, x)[0] - 0.5 * x.shape[1] * float(np.log(len(at.target))), place, s)
+        for _, place, s, x in found[:RANKED]
+    ]
+    return sorted(out, key=lambda f: -f[0])
+
+
+def _energy(x: np.ndarray, target: np.ndarray) -> float:
+    """Return the energy of the target that columns explain."""
+    scale = np.linalg.norm(x, axis=0)
+    u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
+
+
+def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Return straight lines between the knots of a signal (N, knots): the columns of a free function."""
+    if len(knots) < 2:
+        return np.ones((len(v), 1))
+    return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the gain in log likelihood of these columns at their best sizes, and the sizes."""
+    scale = np.linalg.norm(x, axis=0)
+    scale[scale == 0] = 1.0
+    c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
+    return at.above(at.target - x @ c), c
+
+
+def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
+    """Return the terms at a place, the best KEPT of each form over each signal."""
+    still = at.columns(place, [np.ones((len(d.t), 1)) for d in at.metric.drives])
+    out = []
+    for part in _chunks(families(found, every, at.duration, at.sample)):
+        flows = [
+            np.concatenate([f.values(run, d.t) for f in part], axis=1)
+            for run, d in zip(at.runs, at.metric.drives, strict=True)
+        ]
+        x = at.columns(place, flows)
+        ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
+        for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
+            out += _best(at, place, f, own, still if f.signals else np.zeros_like(still))
+    return out
+
+
+def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
+    """Yield families in groups of CHUNK terms and more."""
+    part: list[Family] = []
+    for f in found:
+        part.append(f)
+        if sum(q.count for q in part) >= CHUNK:
+            yield part
+            part = []
+    if part:
+        yield part
+
+
+def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
+    """Return the terms of a family that explain most, without those that look like a constant."""
+    n = len(f.form.sizes)
+    with np.errstate(all="ignore"):
+        square = np.einsum("rk,rk->k", x, x)
+        gain = (at.target @ x) ** 2 / square
+        alike = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
+    if n > 1:
+        gain = np.repeat([_energy(own, at.target) for own in np.split(x, f.count, axis=1)], n)
+    usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~alike)
+    gain = np.where(usable, gain, -1.0)[::n]
+    order = [k for k in np.argsort(-gain, kind="stable")[:KEPT] if gain[k] >= 0]
+    return [Found(float(gain[k]), place, f.term(k), x[:, k * n : (k + 1) * n].copy()) for k in order]
+
+
+def _zoomed(at: Tracked, found: Found) -> Found:
+    """Return a term at better values of its shapes, between its neighbours on a grid that gets finer."""
+    t = found.term
+    grid = {q: np.unique(s.scaled(s.values, t.signals[0], t.duration)) for q, s in t.form.shapes.items()}
+    for _ in range(ZOOMS if grid else 0):
+        grid = {q: _between(v, found.term.shapes[q]) for q, v in grid.items()}
+        f = Family(t.form, t.signals, combined(grid), t.duration, t.sample)
+        x = at.columns(
+            found.place, [f.values(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        )
+        best = _best(at, found.place, f, x, np.zeros((len(x), 1)))[:1]
+        found = max([found, *best], key=lambda b: b.gain)
+    return found
+
+
+def _between(values: np.ndarray, v: float) -> np.ndarray:
+    """Return FINE values between the neighbours of the value nearest to v."""
+    k = int(np.argmin(np.abs(values - v)))
+    return np.linspace(values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)], FINE)
+
+
+def _varied(pool: Sequence[Found]) -> list[Found]:
+    """Return the best value of the shapes of each form over each signal at each place, at most POOL."""
+    best: dict[Any, Found] = {}
+    for f in pool:
+        best.setdefault((f.place, f.kind), f)
+    return list(best.values())[:POOL]
+
+
+def _proposal(
+    at: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, float]
+) -> Proposal:
+    promise, c = _promise(at, x)
+    p = Proposal(place, law, tuple(map(float, c)), promise, *base)
+    dims = len(c) + p.shapes
+    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(at.target))))
+
+
+def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
+    """Return sums of two and three terms at a place.
+
+    Each grows by what another term adds: from the best term, and from the best pairs. A pair may explain much
+    where each of its terms alone does not, because the plant's own parameters imitate it. Terms that do not
+    reverse with what drives the flow are rare: the best pairs without them are tried, too."""
+    likely = [f for f in pool if f.term.reverses is not False]
+    found = _pairs(at, pool) + (_pairs(at, likely) if len(likely) < len(pool) else [])
+    pairs = []
+    for a, b in found:
+        x = np.concatenate([a.columns, b.columns], axis=1)
+        pairs.append((_proposal(at, place, (a.term, b.term), x, base), x))
+    pairs.sort(key=lambda p: -p[0].score)
+    starts: list[tuple[tuple[Term, ...], np.ndarray]] = [((f.term,), f.columns) for f in pool[:1]]
+    starts += [(p.terms, x) for p, x in pairs[:GROWN]]
+    out = [p for p, _ in pairs]
+    for law, columns in starts:
+        while len(law) < TERMS:
+            added = _added(at, law, columns, pool[:POOL])
+            if added is None:
+                break
+            law, columns = (*law, added.term), np.concatenate([columns, added.columns], axis=1)
+            out.append(_proposal(at, place, law, columns, base))
+    return out
+
+
+def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence[Found]) -> Found | None:
+    """Return the term that explains most of what a sum of terms leaves."""
+    q, _ = np.linalg.qr(columns)
+    rest = at.target - q @ (q.T @ at.target)
+    best, most = None, 0.0
+    for f in pool:
+        own = f.columns - q @ (q.T @ f.columns)
+        if f.term in law or np.linalg.norm(own) < 1e-3 * np.linalg.norm(f.columns):
+            continue
+        c = np.linalg.lstsq(own, rest, rcond=1e-8)[0]
+        gain = float(rest @ rest - np.sum((rest - own @ c) ** 2))
+        if best is None or gain > most:
+            best, most = f, gain
+    return best
+
+
+def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
+    """Return the pairs of terms that explain most together, one for each two forms and signals."""
+    single = [f for f in pool if f.columns.shape[1] == 1][:PAIRED]
+    if len(single) < 2:
+        return []
+    v = np.concatenate([f.columns for f in single], axis=1)
+    v = v / np.linalg.norm(v, axis=0)
+    g, c = v.T @ at.target, np.clip(v.T @ v, -ALIKE, ALIKE)
+    joint = (g[:, None] ** 2 + g[None] ** 2 - 2 * c * np.outer(g, g)) / (1 - c**2)
+    joint = np.triu(np.where(abs(c) < ALIKE, joint, 0.0), 1)
+    out: dict[Any, tuple[Found, Found]] = {}
+    for k in np.argsort(-joint, axis=None)[:LIKELY]:
+        a, b = (single[i] for i in np.unravel_index(k, joint.shape))
+        out.setdefault(frozenset((a.kind, b.kind)), (a, b))
+        if len(out) == PAIRS:
+            break
+    return list(out.values())
+
+
+def _mixed(found: Sequence[Proposal]) -> list[Proposal]:
+    """Return laws to refit: the best, the best of one term, one of each signal, then the rest by score.
+
+    Sums promise more than they hold, and the plant may follow a law but badly."""
+    single = [p for p in found if len(p.terms) == 1]
+    signal: dict[Any, Proposal] = {}
+    for p in single:
+        if len(p.terms[0].signals) == 1:
+            signal.setdefault((p.place, p.terms[0].signals), p)
+    chosen = [*found[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *found]
+    return _distinct(chosen)[:PROPOSALS]
+
+
+def _distinct(found: Sequence[Proposal]) -> list[Proposal]:
+    """Return proposals whose forms, signals or places differ."""
+    out: dict[Any, Proposal] = {}
+    for p in found:
+        out.setdefault(p.kind, p)
+    return list(out.values())

@@ -1,0 +1,144 @@
+"""Refit a proposed law in the whole plant, as a hypothesis like any other."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
+from thermoctl.diagnosis.hypothesis import places as catalogue_places
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.law.forms import law_effect, readable
+from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
+from thermoctl.diagnosis.law.smooth import law_unit
+from thermoctl.plant import expression as ex
+from thermoctl.plant.simulate import SimulationError
+from thermoctl.yamlfile import InputError
+
+FEWEST_REFITS = 3  # of a plant of many bodies, see NUMBERS
+SIMPLER = 6  # further refits, of sums of terms without their least significant one
+NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all refits take less than a minute
+RANGE = 100.0  # times its first size that the size of a term may reach
+
+
+@dataclasses.dataclass(frozen=True)
+class PlacedLaw(Placed):
+    """A law among the effects of a hypothesis, with its terms; other laws there, and the share of each."""
+
+    proposal: Proposal
+    rivals: tuple[tuple[Proposal, Fitted, float], ...] = ()
+
+
+def law_of(f: Fitted) -> PlacedLaw | None:
+    """Return the last law of a hypothesis, None where it holds none."""
+    return next((e for e in reversed(f.hypothesis.effects) if isinstance(e, PlacedLaw)), None)
+
+
+def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fitted | None:
+    """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
+
+    The refit ends early if it stays far from `leader`, the likeliest one so far."""
+    rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
+    c = law_candidate(rig, p)
+    values, ranges = _start(p)
+    plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
+    own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
+    c = dataclasses.replace(c, effect=_bounded(c, ranges))
+    try:
+        return fitted(case, plant, (*parent.hypothesis.effects, PlacedLaw(c, own, p)), None, leader, parent)
+    except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
+        return None
+
+
+def law_candidate(rig: Structure, p: Proposal) -> Candidate:
+    """Return a law as an effect at its place."""
+    effect = law_effect(p.terms, p.place, law_unit(rig.plant, p.place))
+    ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
+    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
+
+
+def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Any:
+    new = tuple(
+        dataclasses.replace(q, low=ranges[q.name][0], high=ranges[q.name][1])
+        if q.name in ranges and not q.amplitude
+        else q
+        for q in c.effect.parameters
+    )
+    return dataclasses.replace(c.effect, parameters=new)
+
+
+def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Return the values that a refit starts from, and the ranges of what it moves."""
+    values: dict[str, float] = {}
+    ranges: dict[str, tuple[float, float]] = {}
+    sizes = iter(p.sizes)
+    for k, t in enumerate(p.terms, 1):
+        for q in t.form.sizes:
+            v = next(sizes)
+            values[f"{q}{k}"] = v
+            reach = RANGE * max(abs(v), 1e-300)
+            ranges[f"{q}{k}"] = (-reach, reach)
+        for q, shape in t.form.shapes.items():
+            low, high = shape.scaled(shape.range, next(iter(t.signals), None), t.duration)
+            values[f"{q}{k}"], ranges[f"{q}{k}"] = t.shapes[q], (low, high)
+    return values, ranges
+
+
+def simpler_law(p: Proposal, f: Fitted) -> Proposal:
+    """Return a refitted law without its least significant term, at the values of the refit."""
+    c, values = f.hypothesis.effects[-1].candidate, f.plant.parameters
+
+    def value(q: str) -> float:
+        """Return the fitted value of a parameter of the law."""
+        return values[c.own(q)].value
+
+    sizes = [[value(f"{q}{k}") for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
+    significant = [
+        max(abs(value(f"{q}{k}")) / max(f.sd.get(c.own(f"{q}{k}"), 0.0), 1e-300) for q in t.form.sizes)
+        for k, t in enumerate(p.terms, 1)
+    ]
+    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(significant))]
+    terms = tuple(
+        dataclasses.replace(p.terms[k], shapes={q: value(f"{q}{k + 1}") for q in p.terms[k].form.shapes})
+        for k in kept
+    )
+    return dataclasses.replace(p, terms=terms, sizes=tuple(v for k in kept for v in sizes[k]))
+
+
+def affordable(case: Case, parent: Fitted) -> int:
+    """Return how many laws may be refitted: a count of the work, the same on every machine."""
+    rows = sum(len(t) for t in case.tables)
+    model = parent.rough.model
+    numbers = rows * len(model.states) * (len(model.unknowns) + 1)
+    return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, PROPOSALS + SIMPLER))
+
+
+def law_rate(f: Fitted) -> ex.Expr:
+    """Return the flow, or the storage, of the last law that a hypothesis holds."""
+    law = law_of(f)
+    assert law is not None
+    own, nodes = set(law.own.values()), law.candidate.place.nodes
+    if "storage" in law.candidate.effect.changes[0][-1]:
+        return f.plant.nodes[nodes["target"]].storage
+    return next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
+
+
+def at_bound(f: Fitted) -> bool:
+    """Return whether a parameter of the law is at its bound: the form degenerates to a simpler one."""
+    return bool(set(f.hypothesis.effects[-1].own.values()) & f.fit.at_bound.keys())
+
+
+def equation(rate: ex.Expr, f: Fitted) -> str:
+    """Return a law's flow with short names of its parameters."""
+    law = law_of(f)
+    assert law is not None
+    c, text = law.candidate, readable(rate)
+    for q in c.effect.parameters:
+        text = re.sub(rf"\b{re.escape(c.own(q.name))}\b", q.name, text)
+    return re.sub(rf"\b(m\d)_{re.escape(c.own('')[1:])}\b", r"\1", text)

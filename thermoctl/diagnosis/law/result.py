@@ -1,0 +1,268 @@
+"""A law in the result: its entry in diagnosis.json, its section of the report, its effect file."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.held_out import Worth
+from thermoctl.diagnosis.hypothesis.rig import zero_of
+from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.propose import Proposal
+from thermoctl.diagnosis.law.refit import equation, law_rate
+from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.language import Plant
+from thermoctl.report.page import figure, table, unit
+from thermoctl.safe_file import make_folder, write_text
+from thermoctl.yamlfile import InputError
+
+WIDE = 1.96  # standard deviations to either side of a 95 % interval
+EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
+
+
+def law_entry(law: Law | None, worth: Worth) -> dict[str, Any] | None:
+    """Return `remainder.law` of diagnosis.json."""
+    if law is None:
+        return None
+    f, p, place = law.fitted, law.proposal, law.proposal.place
+    return {
+        "where": place.where,
+        "part": place.part,
+        "expression": equation(law.rate, f),
+        "into": place.target,
+        "from": place.source,
+        "terms": [str(t.expression(k)) for k, t in enumerate(p.terms, 1)],
+        "forms": _terms(p),
+        "memory": {f"m{k}": t.memory_text(k) for k, t in enumerate(p.terms, 1) if t.form.memory},
+        "of": sorted({s.label for t in p.terms for s in t.signals}),
+        "parameters": _parameters(law),
+        "probability": round(law.probability, 4),
+        "confirmed": round(law.confirmed, 4),
+        "gain": law.gain,
+        "rms": f.fit.rms(),
+        "share_closed": worth.share_closed,
+        "held_out": worth.reserved,
+        "equivalent": family(law),
+        "effect": effect_file(law),
+    }
+
+
+def _terms(p: Proposal) -> list[dict[str, Any]]:
+    """Return form and signals of each term, and the names of its parameters."""
+    return [
+        {
+            "form": t.form.name,
+            "variables": [s.label for s in t.signals],
+            "sizes": {q: f"{q}{k}" for q in t.form.sizes},
+            "shapes": {q: f"{q}{k}" for q in t.form.shapes},
+        }
+        for k, t in enumerate(p.terms, 1)
+    ]
+
+
+def _parameters(law: Law) -> dict[str, Any]:
+    c, plant = law.placed.candidate, law.fitted.plant
+    used = {q.name: c.own(q.name) for q in c.effect.parameters if c.own(q.name) in plant.parameters}
+    return {
+        short: {
+            "value": plant.parameters[q].value,
+            "sd": law.fitted.sd.get(q),
+            "unit": plant.parameters[q].unit,
+        }
+        for short, q in used.items()
+    }
+
+
+def family(law: Law) -> list[str]:
+    """Return what the recordings leave open: the exponents within 95 %, and laws that fit about as well."""
+    out = []
+    c, plant = law.placed.candidate, law.fitted.plant
+    for k, t in enumerate(law.proposal.terms, 1):
+        for q in t.form.shapes:
+            long = c.own(f"{q}{k}")
+            value, sd = plant.parameters[long].value, law.fitted.sd.get(long, 0.0)
+            of = ", ".join(s.label for s in t.signals)
+            out.append(
+                f"{q}{k} of the {t.form.name.replace('_', ' ')} in {of}: {value - WIDE * sd:.3g} to {value + WIDE * sd:.3g}"
+            )
+    return out + [
+        f"{described(p, f)} fits about as well (probability {share:.2f})" for p, f, share in law.rivals
+    ]
+
+
+def described(p: Proposal, f: Fitted) -> str:
+    """Return a law as an expression with its place."""
+    return f"{equation(law_rate(f), f)} at {p.place.where}"
+
+
+def law_section(law: Law | None, entry: Mapping[str, Any] | None) -> str:
+    """Return the report's section: the law, its parameters, its family, and the curve with its band."""
+    if law is None or entry is None:
+        return ""
+    body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
+    rows = [
+        (n, p["value"], unit(p["unit"]), f"± {WIDE * p['sd']:.2g}" if p["sd"] else "known")
+        for n, p in entry["parameters"].items()
+    ]
+    body += table(("parameter", "value", "unit", "95 %"), rows)
+    if entry["equivalent"]:
+        body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["equivalent"]) + "</ul>"
+    where = "recordings set aside" if entry["held_out"] else "cross-validated data"
+    body += f"<p>On {where} it closes {100 * entry['share_closed']:.0f} % of the energy of the misfit.</p>"
+    return (
+        body
+        + _drawing(law)
+        + "<p>thermoctl effects save DIR NAME writes it as an effect of your own catalogue.</p>"
+    )
+
+
+def _drawing(law: Law) -> str:
+    from matplotlib.figure import Figure
+
+    c = law.curve
+    if c is None:
+        return ""
+    fig = Figure(figsize=(6, 3.4), layout="constrained")
+    axis = fig.subplots()
+    axis.fill_between(
+        c.at, c.flow - WIDE * c.sd, c.flow + WIDE * c.sd, color="0.85", label="any function, 95 %"
+    )
+    axis.plot(c.at, c.flow, ".", color="#1b1f24", label="any function")
+    axis.plot(c.at, c.law, color="#0b6bcb", label="law")
+    axis.set_xlabel(f"{c.signal.label} ({unit(c.signal.unit)})" if c.signal.unit else c.signal.label)
+    axis.set_ylabel(f"flow ({unit(law.unit)})" if law.unit else "flow")
+    axis.legend(frameon=False, fontsize=8)
+    return figure(
+        fig,
+        "The flow as a free function of the signal, and the law. Parts that the plant's own parameters absorb are the law's.",
+    )
+
+
+# ------------------------------------------------------------------------------------------------ effect file
+
+
+def effect_file(law: Law) -> dict[str, Any]:
+    """Return the content of an effect file: sizes are fitted again, shapes start at the values found here."""
+    c, plant = law.placed.candidate, law.fitted.plant
+    where, swap = _symbols(law, plant)
+    parameters: dict[str, Any] = {}
+    sizes = 0
+    for q in c.effect.parameters:
+        own = c.own(q.name)
+        p = plant.parameters.get(own)
+        if p is None:
+            continue
+        entry: dict[str, Any] = {"unit": p.unit} if p.unit else {}
+        if q.amplitude:
+            sizes += 1
+            entry["trial"] = "s" if sizes == 1 else f"s{sizes}"
+        else:
+            low, high = p.range or (p.value, p.value)
+            entry |= {
+                "unit": p.unit or "1",
+                "trial": repr(p.value),
+                "null": p.value,
+                "low": low,
+                "high": high,
+            }
+        parameters[q.name] = entry
+    changes = [_general(item, swap, _ends(where)) for item in c.effect.changes[0]]
+    variables = ", ".join(sorted({s.label for t in law.proposal.terms for s in t.signals}))
+    read = _names(changes)
+    needs = ["x"] if where == "velocity_node" and "x" in read else []
+    reads = sorted(read & (plant.inputs.keys() | plant.nodes.keys()))
+    return {
+        "effect": "law",
+        "title": f"Law over {variables}, proposed from recordings",
+        "where": where,
+        **({"needs": needs} if needs else {}),
+        **({"reads": reads} if reads else {}),
+        "change": changes,
+        "parameters": parameters,
+        "excited_by": f"the visited range of {variables}",
+        "source": f"thermoctl diagnose of {Path(plant.file).name}",
+    }
+
+
+def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> dict[str, Any]:
+    """Return a change of an effect with the symbols of an effect file."""
+
+    def told(text: str) -> str:
+        """Return an expression with the names that a reader knows."""
+        return str(ex.substitute(ex.parse(text), swap))
+
+    ((kind, what),) = change.items()
+    if isinstance(what, str):
+        return {kind: told(what)}
+    out = {k: told(v) if k in ("rate", "initial") else v for k, v in what.items()}
+    return {kind: {k: ends.get(v, v) if k in ("into", "from") else v for k, v in out.items()}}
+
+
+def _names(changes: Sequence[Mapping[str, Any]]) -> set[str]:
+    rates = [what if isinstance(what, str) else what.get("rate", "0") for c in changes for what in c.values()]
+    return set().union(*(ex.names(ex.parse(r)) for r in rates))
+
+
+def _ends(where: str) -> dict[str, str]:
+    symbol = {"temperature_node": "T", "velocity_node": "v"}.get(where, "n")
+    return {"target": symbol, "source": "m"} if where == "node_pair" else {"target": symbol}
+
+
+def _symbols(law: Law, plant: Plant) -> tuple[str, Any]:
+    """Return the kind of place, and the change of the plant's names to the symbols of an effect file."""
+    place, rig = law.proposal.place, law.placed.candidate.rig
+    target, symbols = place.target, dict[str, Expr]()
+    where = EVERY
+    if place.source:
+        where, symbols = "node_pair", {target: name("n"), place.source: name("m")}
+    elif target in rig.temperatures and rig.air:
+        where = "temperature_node"
+        symbols = {
+            n: _celsius(name(s), u)
+            for n, s, u in (
+                (target, "T", plant.nodes[target].unit),
+                (rig.air, "air", _unit_of(plant, rig.air)),
+            )
+        }
+    elif target in rig.velocities:
+        where, symbols = "velocity_node", {target: name("v")}
+        if target in rig.position_of:
+            symbols[rig.position_of[target]] = name("x")
+    else:
+        symbols = {target: name("n")}
+    return where, lambda e: symbols.get(str(e.value)) if e.op == "name" else None
+
+
+def _celsius(e: Expr, its_unit: str | None) -> Expr:
+    zero = zero_of(its_unit)
+    return ex.add(e, num(zero)) if zero else e
+
+
+def _unit_of(plant: Plant, signal: str) -> str | None:
+    known = plant.inputs.get(signal) or plant.parameters.get(signal)
+    return known.unit if known else None
+
+
+def save_effect(found: Mapping[str, Any], label: str, folder: Path) -> Path:
+    """Write the law of a diagnosis as an effect file of this name, and return its path. Raises InputError."""
+    law = (found.get("remainder") or {}).get("law")
+    if not law:
+        raise InputError(
+            "this diagnosis has no law to save; one with `remainder.law` in diagnosis.json was expected"
+        )
+    if not label.isidentifier():
+        raise InputError(f"'{label}': a name of letters, digits and _ was expected, such as windage")
+    make_folder(folder)
+    path = folder / f"{label}.yaml"
+    if path.exists():
+        raise InputError(f"{path}: exists already; another name or folder (--effects) was expected")
+    effect = {**law["effect"], "effect": label}
+    write_text(path, yaml.safe_dump(effect, sort_keys=False, allow_unicode=True))
+    return path

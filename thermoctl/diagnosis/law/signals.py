@@ -1,0 +1,146 @@
+"""The signals that a law may depend on, and the places where it may act."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, zero_of
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.units import conversion, dimension
+
+QUANTILES = 21  # of a signal: each 5 %
+
+Values = Mapping[str, np.ndarray | float]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a law acts.
+
+    - flow: into the node `target` from outside, or from the node `source`
+    - storage: of the node `target`"""
+
+    target: str
+    source: str | None = None
+    part: str = "flow"
+
+    @property
+    def where(self) -> str:
+        """Its name in a result."""
+        if self.part != "flow":
+            return f"{self.part} of {self.target}"
+        return f"{self.source}-{self.target}" if self.source else self.target
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes that it changes."""
+        return (self.source, self.target) if self.source else (self.target,)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal of the plant: an expression, its unit, its typical size.
+
+    `visited`: its evenly spaced quantiles from the smallest to the largest value, over its size.
+    `drives`: a difference or a velocity that drives the flow at its place, and reverses it. `daily`: the time
+    of day, with a day as its size."""
+
+    label: str
+    value: Expr
+    unit: str | None
+    size: float = 1.0
+    centre: float = 0.0
+    visited: tuple[float, ...] = (-1.0, 1.0)
+    kelvin: float | None = None  # offset to kelvins; None: no absolute temperature
+    position: bool = False
+    drives: bool = False
+    recorded: bool = False
+    daily: bool = False
+
+    def along(self, run: Values, t: np.ndarray) -> np.ndarray:
+        """Return its values (N,) along a trajectory."""
+        values = np.broadcast_to(np.asarray(ex.evaluate(self.value, run), float), t.shape)
+        return values % self.size if self.daily else values
+
+
+def places(rig: Structure) -> list[Place]:
+    """Return the flow into every node that stores something, and between nodes that exchange one; storages.
+
+    A storage of 1 is a definition: dn/dt is the sum of the flows."""
+    positions = set(rig.pairs.values())
+    flows = rig.physics.flows.values()
+    nodes = [
+        n for n in rig.physics.nodes if n not in positions and any(n in (f.source, f.target) for f in flows)
+    ]
+    pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
+    stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
+    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored]
+
+
+def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
+    """Return what a law at a place may depend on, each with its typical size over the runs."""
+    p, out = rig.physics, []
+    positions = set(rig.pairs.values())
+    near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
+
+    def absolute(n: str, unit: str | None) -> None:
+        """Add a node or an input as a signal."""
+        if unit in TEMPERATURE:
+            out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
+        else:
+            own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
+            out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
+
+    def difference(a: str, b: str) -> None:
+        """Add the difference of two nodes as a signal."""
+        unit = _difference(p.nodes[a].unit)
+        drives = place.part == "flow"
+        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=drives))
+
+    for n in near:
+        if rig.air and n in rig.temperatures:
+            difference(n, rig.air)
+        absolute(n, p.nodes[n].unit)
+    if place.source and p.nodes[place.source].unit == p.nodes[place.target].unit:
+        difference(place.source, place.target)
+    for n in p.nodes:
+        if n not in near:
+            absolute(n, p.nodes[n].unit)
+            linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
+            if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
+                difference(place.target, n)
+    clocks = {i for i, q in p.inputs.items() if q.role == "time_of_day"}
+    for i in sorted(rig.moving_inputs - clocks):
+        if i != rig.air and not i.endswith("_start"):
+            absolute(i, p.inputs[i].unit)
+    sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
+    return [s for s in sized if s is not None]
+
+
+def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | None:
+    """Return the time of day as a signal; None where the runs do not visit each of its hours."""
+    if unit is None or dimension(unit) != dimension("s"):
+        return None
+    day = conversion("day", unit)[0]
+    hours = np.floor(24 * np.concatenate([np.atleast_1d(run[clock]) for run in runs]) / day) % 24
+    return Signal(clock, name(clock), unit, day, daily=True) if len(np.unique(hours)) == 24 else None
+
+
+def _difference(unit: str | None) -> str | None:
+    return "K" if unit in TEMPERATURE else unit
+
+
+def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
+    values = np.concatenate([np.atleast_1d(np.asarray(ex.evaluate(s.value, v), float)) for v in runs])
+    centre = float(np.mean(values)) if s.kelvin is not None or s.position else 0.0
+    size = float(np.sqrt(np.mean((values - centre) ** 2)))
+    if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):
+        return None
+    size, centre = float(f"{size:.3g}"), float(f"{centre:.4g}")
+    visited = (np.quantile(values, np.linspace(0, 1, QUANTILES)) - centre) / size
+    return replace(s, size=size, centre=centre, visited=tuple(visited.tolist()))

@@ -1,0 +1,293 @@
+"""Track the recordings with unknown flows at all nodes, and linearise the plant about this trajectory.
+
+    y - y(u^) + D u^ = sum_k c_k D phi_k(x^) + S dtheta + noise
+
+u^: flows at all nodes, straight lines between knots, that bring the plant's outputs to the recorded ones.
+D: exact first-order response of the outputs to flows, S: to parameters and initial states. A law at one node
+replaces all of u^. Regression on this equation equals one on the smoothed flow with its covariance.
+
+The prior of u^ is white, of one size in units of each node's typical flow. The size has the largest marginal
+likelihood."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag, solveh_banded
+from scipy.sparse import csr_matrix
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.where import SHARES, signals, typical_flow
+from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
+from thermoctl.diagnosis.law.signals import Place
+from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import name, num
+from thermoctl.plant.language import Flow, Input, Plant
+from thermoctl.plant.simulate import SimulationError, compile_plant
+
+LATENT = "unknown_flow_into_"
+KNOTS = 240  # of a recording, shared among the nodes
+FEWEST_KNOTS = 24
+ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
+STEPS = 3  # Gauss-Newton steps of the tracking
+TOGETHER = 48  # responses that are simulated at a time
+RESOLVED = 400  # hat functions of a flow; 90 % of responses in a stage and in tanks err by less than 0.7 %
+
+
+@dataclass
+class Tracked:
+    """The plant linearised about the tracked trajectory.
+
+    - `metric`: whitened rows there, the plant's own parameters projected out
+    - `target` (rows,): the misfit that a law has to explain
+    - `runs`: every signal of each recording, along the trajectory
+    - `duration`, `sample`: of the longest run, and between samples, s
+    - `explained`: share of the target that a free flow in time into each node explains"""
+
+    metric: Rows
+    target: np.ndarray
+    runs: list[dict[str, np.ndarray | float]]
+    duration: float
+    sample: float
+    explained: dict[str, float]
+    _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+    @cached_property
+    def above(self) -> Callable[[np.ndarray], float]:
+        """By how much the log likelihood of other rows is above that of the target."""
+        return self.metric.rise(self.target)
+
+    def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
+        """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
+
+        Sums of the responses to RESOLVED hat functions. A storage that is larger by q takes up the flow
+        q dx/dt. A flow that the plant's own parameters absorb gives zeros."""
+        if place.part == "storage":
+            flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
+        units = [self._unit(n) for n in reversed(place.nodes)]
+        with np.errstate(all="ignore"):
+            fine = [_fitted_hats(h, q) for h, q in zip(self._hats, flows, strict=True)]
+            into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
+            whole = into - out[0] if out else into
+            rest = self.metric.project(whole)
+            absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
+        return np.where(absorbed, 0.0, rest)
+
+    @cached_property
+    def _hats(self) -> list[csr_matrix]:
+        return [hat_functions(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
+
+    def _slopes(self, node: str) -> list[np.ndarray]:
+        """Return the rate of a node (N,) by recording, without the unknown flow.
+
+        With it a larger storage, less the plant's own parameter of it, would be the unknown flow."""
+        out, storage = [], self.metric.model.plant.nodes[node].storage
+        for run, d in zip(self.runs, self.metric.drives, strict=True):
+            unknown = run.get(f"{LATENT}{node}", 0.0) / np.asarray(ex.evaluate(storage, run), float)
+            out.append(np.gradient(np.asarray(run[node], float), d.t) - unknown)
+        return out
+
+    def _unit(self, node: str) -> list[np.ndarray]:
+        """Return the rows of each recording's responses to hat functions of flow into a node."""
+        if node not in self._units:
+            self._units[node] = flow_rows(self.metric, self.runs, node, self._hats, 1.0)
+        return self._units[node]
+
+
+def flow_rows(
+    metric: Rows,
+    runs: Sequence[dict[str, np.ndarray | float]],
+    node: str,
+    hats: Sequence[csr_matrix],
+    size: float,
+) -> list[np.ndarray]:
+    """Return the rows of each recording's responses to flows into a node: hats times `size`.
+
+    TOGETHER at a time, for memory."""
+    blocks, model = [], metric.model
+    for r, (d, hat) in enumerate(zip(metric.drives, hats, strict=True)):
+        parts, q = [], size * hat.toarray()
+        storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
+        force = q / np.broadcast_to(storage, d.t.shape)[:, None]
+        for part in np.split(force, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
+            k = part.shape[1]
+            entries = [(model.states.index(node), j) for j in range(k)]
+            dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], entries, part, k)
+            parts.append(metric.rows(r, dy))
+        blocks.append(np.concatenate(parts, axis=1))
+    return blocks
+
+
+def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
+    """Return the plant with a recorded flow into each node.
+
+    Its slope does not change with the storage's parameters. In a plant whose storages and rates may share one
+    factor, this factor would else absorb every flow."""
+    inputs = {f"{LATENT}{n}": Input(f"{LATENT}{n}", None, f"{LATENT}{n}", True) for n in nodes}
+    rates = {k: ex.mul(name(k), _scaling(plant, k.removeprefix(LATENT))) for k in inputs}
+    flows = {k: Flow(k, rate, None, k.removeprefix(LATENT)) for k, rate in rates.items()}
+    return dataclasses.replace(plant, inputs={**plant.inputs, **inputs}, flows={**plant.flows, **flows})
+
+
+def _scaling(plant: Plant, node: str) -> ex.Expr:
+    """Return a node's storage over its value at the plant's parameters."""
+    known, storage = plant.parameters, plant.nodes[node].storage
+    if not ex.names(storage) & known.keys():
+        return ex.ONE
+    now = ex.substitute(storage, lambda e: num(known[e.value].value) if e.value in known else None)
+    return ex.div(storage, now)
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """The plant linearised about the trajectory that follows the recordings best.
+
+    - `misfit`: of each recording, whitened rows of y - y(u^) + D u^
+    - `wide`: of each recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
+
+    metric: Rows
+    runs: list[dict[str, np.ndarray | float]]
+    misfit: list[np.ndarray]
+    wide: list[np.ndarray]
+
+
+def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
+    """Follow the recordings with unknown flows into nodes. Raises SimulationError.
+
+    The knots of one recording do not touch another one: each is solved alone."""
+    if not nodes:
+        raise SimulationError("the plant has no node that an unknown flow could enter")
+    f = as_refitted(case, f)
+    plant = with_latent(f.rough_plant, nodes)
+    model = compile_plant(plant)
+    # with a law a parameter may leave the bound that the refit without it pressed it to
+    rough = dataclasses.replace(f.rough, model=model, at_bound={})
+    base = dataclasses.replace(f, rough=rough, rough_plant=plant)
+    knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
+    hats = [hat_functions(t.t - t.t[0], knots) for t in case.tables]
+    weights = [np.zeros((knots, len(nodes))) for _ in hats]
+    sizes: list[float] = []
+    best: tuple[float, _Followed] | None = None
+    for _ in range(STEPS + 1):
+        tables = tuple(
+            dataclasses.replace(
+                t, columns={**t.columns, **{f"{LATENT}{n}": h @ w[:, i] for i, n in enumerate(nodes)}}
+            )
+            for t, h, w in zip(case.tables, hats, weights, strict=True)
+        )
+        try:
+            plain = Plain(dataclasses.replace(case, tables=tables), base, ROWS)
+            metric = Rows(plain, f.average, False)
+        except SimulationError:
+            break
+        runs = [
+            signals(model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
+        ]
+        sizes = sizes or [typical_flow(f.rough_plant, n, runs) or 1.0 for n in nodes]
+        residual = [
+            metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
+        ]
+        size = sum(float(e @ e) for e in residual)
+        if best is not None and size >= best[0]:
+            break
+        wide = _wide(metric, runs, nodes, sizes, hats)
+        scaled = [(w / np.array(sizes)).T.ravel() for w in weights]
+        misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
+        best = size, _Followed(metric, runs, misfit, wide)
+        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in _smoothed(wide, misfit)]
+    if best is None:
+        raise SimulationError("the plant cannot be tracked")
+    return best[1]
+
+
+def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
+    """Track the recordings from a fitted hypothesis. Raises SimulationError."""
+    at = _followed(case, f, nodes)
+    target = at.metric.project(np.concatenate(at.misfit))
+    duration = max(float(d.t[-1]) for d in at.metric.drives)
+    sample = max(float(np.median(np.diff(d.t))) for d in at.metric.drives)
+    of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in at.wide), strict=True)
+    explained = {
+        n: _explained(at.metric.project(block_diag(*x)), target) for n, x in zip(nodes, of_nodes, strict=True)
+    }
+    return Tracked(at.metric, target, at.runs, duration, sample, explained)
+
+
+def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
+    """Return the rms of the flow into a node, in its unit, that brings the plant to the recordings.
+
+    `f`: the fitted plant. None where it cannot be tracked."""
+    try:
+        runs = _followed(case, f, [node]).runs
+    except (SimulationError, np.linalg.LinAlgError):
+        return None
+    return float(np.sqrt(np.mean(np.concatenate([run[f"{LATENT}{node}"] for run in runs]) ** 2)))
+
+
+def flow_unit(plant: Plant, node: str) -> str | None:
+    """Return the unit of the flows at a node, None where none is stated."""
+    return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
+
+
+def law_unit(plant: Plant, place: Place) -> str | None:
+    """Return the unit of a law at a place, None where the plant states none."""
+    flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
+    if place.part == "flow" or not flow or not own:
+        return flow if place.part == "flow" else None
+    return f"({flow}) * s / ({'K' if own in TEMPERATURE else own})"
+
+
+def _explained(x: np.ndarray, target: np.ndarray) -> float:
+    u, s, _ = np.linalg.svd(x, full_matrices=False)
+    along = u[:, s > ABSORBED * s[0]].T @ target
+    return float(along @ along) / max(float(target @ target), 1e-300)
+
+
+def hat_functions(t: np.ndarray, knots: int) -> csr_matrix:
+    """(N, knots) straight lines between evenly spaced knots."""
+    at, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
+    k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, knots - 2)
+    part = (t - at[k]) / (at[k + 1] - at[k])
+    entries = np.concatenate([n, n]), np.concatenate([k, k + 1])
+    return csr_matrix((np.concatenate([1 - part, part]), entries), shape=(len(t), knots))
+
+
+def _fitted_hats(hats: csr_matrix, flows: np.ndarray) -> np.ndarray:
+    """Return the weights (knots, k) of hat functions (N, knots) that fit flows (N, k) by least squares."""
+    square = (hats.T @ hats).tocsr()
+    bands = np.stack([np.concatenate([[0.0], square.diagonal(1)]), square.diagonal()])
+    return solveh_banded(bands, hats.T @ np.nan_to_num(flows), check_finite=False)
+
+
+def _wide(
+    metric: Rows,
+    runs: Sequence[dict[str, np.ndarray | float]],
+    nodes: Sequence[str],
+    sizes: Sequence[float],
+    hats: Sequence[csr_matrix],
+) -> list[np.ndarray]:
+    """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
+    by_node = [flow_rows(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
+    return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
+
+
+def _smoothed(wide: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the mean of each recording's flows, with the prior size of the largest marginal likelihood."""
+    parts = [np.linalg.svd(x, full_matrices=False) for x in wide]
+    along = [u.T @ e for (u, _, _), e in zip(parts, targets, strict=True)]
+
+    def score(share: float) -> float:
+        """Twice the log marginal likelihood, up to a constant."""
+        variances = [1 + (share * s) ** 2 for _, s, _ in parts]
+        return sum(float(a**2 @ (1 - 1 / v) - np.log(v).sum()) for a, v in zip(along, variances, strict=True))
+
+    best = max(SHARES, key=score)
+    return [
+        v.T @ (best**2 * s / (1 + (best * s) ** 2) * a) for (_, s, v), a in zip(parts, along, strict=True)
+    ]

@@ -1,0 +1,151 @@
+"""Does an effect grow? Its size in each recording, against the recordings' dates.
+
+At the joint refit, recording r alone pulls on the effect's size with gradient g and curvature h. Its own
+initial states are eliminated, the plant's other parameters stay at the joint refit. So its own size is
+
+    joint size + g / h,   standard deviation 1 / sqrt(h)
+
+A straight line over the dates gives the change a month.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
+from thermoctl.diagnosis.evidence.posterior import Placed, Posterior
+from thermoctl.recording.dates import begun, line
+from thermoctl.yamlfile import InputError
+
+
+def trends(
+    case: Case, f: Fitted, shown: Sequence[Placed], before: Sequence[Mapping[str, Any]] = ()
+) -> list[dict[str, Any]]:
+    """Return the sizes of the effects by recording, and each size's change a month, as the result holds them.
+
+    `before`: the trends of an earlier diagnosis, whose recordings come first."""
+    posterior = Posterior(case, f.plant, f.hypothesis.effects)
+    dates = [begun(t) for t in case.tables]
+    old = {(e["effect"], e["where"], e["parameter"]): e["recordings"] for e in before}
+    out = []
+    for e in shown:
+        for p in e.candidate.effect.parameters:
+            if not p.amplitude or p.name not in e.own:
+                continue
+            own = _sizes(posterior, f, e.own[p.name])
+            found = [
+                *old.get((*e.key, p.name), ()),
+                *(
+                    {
+                        "recording": t.name,
+                        "begun_s": None if math.isnan(at) else at,
+                        "value": float(v),
+                        "sd": float(sd),
+                    }
+                    for t, at, (v, sd) in zip(case.tables, dates, own, strict=True)
+                    if math.isfinite(sd)
+                ),
+            ]
+            found.sort(key=lambda r: (r["begun_s"] is None, r["begun_s"] or 0.0))
+            dated = [r for r in found if r["begun_s"] is not None]
+            slope, error = line([r["begun_s"] for r in dated], [(r["value"], r["sd"]) for r in dated])
+            known = math.isfinite(error)
+            out.append(
+                {
+                    "effect": e.key[0],
+                    "where": e.key[1],
+                    "parameter": p.name,
+                    "unit": f.plant.parameters[e.own[p.name]].unit,
+                    "recordings": found,
+                    "per_month": slope if known else None,
+                    "per_month_sd": error if known else None,
+                    "changes": known and abs(slope) > SIGNIFICANT * error,
+                }
+            )
+    return out
+
+
+def earlier_trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
+    """Return the trends in the result of an earlier diagnosis. Raises InputError for a damaged one."""
+    path = earlier / "diagnosis.json" if earlier else None
+    if path is None or not path.exists():
+        return ()
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return [
+            {k: str(t[k]) for k in ("effect", "where", "parameter")}
+            | {"recordings": [_read_size(r) for r in t["recordings"]]}
+            for t in found.get("trends", ())
+        ]
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read: {e.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as e:  # no JSON, or not what the engine wrote
+        raise InputError(
+            f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
+            "recordings again"
+        ) from None
+
+
+def _read_size(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect's size in one recording. Raises ValueError, KeyError, TypeError."""
+    begun = entry["begun_s"]
+    numbers = {k: float(entry[k]) for k in ("value", "sd")} | (
+        {} if begun is None else {"begun_s": float(begun)}
+    )
+    if not all(map(math.isfinite, numbers.values())) or numbers["sd"] <= 0:
+        raise ValueError(f"finite numbers and an sd above 0 were expected, found {numbers}")
+    return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
+
+
+def told(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the trends that are significant, as sentences."""
+    return [
+        f"{t['effect']} at {t['where']} changes with the recordings' dates: {t['parameter']} by {t['per_month']:+.3g} "
+        f"± {1.96 * t['per_month_sd']:.2g} {t['unit'] or ''} in 30 days, {_day(t['recordings'][0])} to "
+        f"{_day([r for r in t['recordings'] if r['begun_s'] is not None][-1])}"
+        for t in found
+        if t["changes"]
+    ]
+
+
+def _day(recording: Mapping[str, Any]) -> str:
+    return str(np.datetime64(int(recording["begun_s"]), "s").astype("datetime64[D]"))
+
+
+def _sizes(posterior: Posterior, f: Fitted, parameter: str) -> list[tuple[float, float]]:
+    """Return (value, standard deviation) of a parameter in each recording, infinite where it says nothing."""
+    problem, z = posterior.problem, f.fit.z
+    index = posterior.model.parameters.index(parameter)
+    errors = posterior.errors(z)
+    rows = posterior.rows(errors)
+    sums = posterior.sums(z, rows, posterior.likelihood(rows)[0].inverse)
+    initial = np.arange(len(z)) >= problem.n_parameters
+    prior = np.where(np.outer(initial, initial), posterior.precision, 0.0)
+    out = []
+    for r in range(len(posterior.drives)):
+        gradient, matrix = prior @ (posterior.mean - z), prior.copy()
+        unknowns = sums[r].unknowns
+        gradient[unknowns] += sums[r].gradient
+        matrix[np.ix_(unknowns, unknowns)] += sums[r].matrix
+        mine = [k for k, (q, of) in enumerate(problem.unknowns) if q == parameter and of in (None, r)]
+        starts = [k for k, (q, of) in enumerate(problem.unknowns) if initial[k] and of == r]
+        value = float(f.fit.values[r, index])
+        if not mine:
+            out.append((value, math.inf))
+            continue
+        a = mine[0]
+        absorbed = np.linalg.solve(matrix[np.ix_(starts, starts)], matrix[np.ix_(starts, [a])])[:, 0]
+        h = matrix[a, a] - float(absorbed @ matrix[starts, a])
+        g = gradient[a] - float(absorbed @ gradient[starts])
+        slope = problem.scales[parameter].slope(value)
+        least = 1e-12 * max(matrix[a, a], 1e-300)
+        shift = 0.0 if problem.unknowns[a][1] is not None else slope * g / h if h > least else 0.0
+        out.append((value + shift, slope / math.sqrt(h) if h > least else math.inf))
+    return out

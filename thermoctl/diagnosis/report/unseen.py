@@ -1,0 +1,126 @@
+"""Detection limits: the smallest size of each effect that recordings show, beside a refit of the plant.
+
+    smallest = SEEN |p(s) - p(0)|,   s = 1 / |d'|
+
+d' is the whitened first-order change of the outputs by the effect at s = 1, without the part that the plant's
+own parameters absorb (screen.py). It depends on the plant, the inputs and the sensors, not on the readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.noise import Averaged
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.result import Diagnosis
+from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values
+from thermoctl.diagnosis.search.overlay import Trajectory
+from thermoctl.diagnosis.search.screen import Norms, directions, groups_of
+from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+
+SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
+ABSORBED = 1e-4  # share of a direction that is left, below which the plant's own parameters imitate it
+STILL = 1e-9  # norm of a whitened direction, below which nothing moves
+SIZES = {"times", "lags", "delays", "small_levels"}  # shapes that are a size: absent at 0
+NOT_EXCITED = "these inputs do not excite it"
+IMITATED = "the plant's own parameters imitate it"
+TOO_LARGE = "its largest size would not show"
+
+
+@dataclass(frozen=True)
+class Visible:
+    """The smallest size of an effect at a place that would show; `reason`: why none would."""
+
+    candidate: Candidate
+    parameter: str
+    unit: str | None
+    smallest: float
+    reason: str | None = None
+
+    def entry(self) -> dict[str, Any]:
+        """Return it as the results' `not_seen` lists it."""
+        effect, where = self.candidate.key
+        smallest = float(f"{self.smallest:.4g}")
+        return {
+            "effect": effect,
+            "where": where,
+            "parameter": self.parameter,
+            "smallest": smallest,
+            "unit": self.unit,
+        }
+
+
+def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
+    """Return by effect and place the smallest size that would have been seen, in the parameter's unit."""
+    null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
+    norms = [n for n in found.searched.norms if sized(n.column.item[0].effect)]
+    seen = _best(norms) if norms else visible(found.case, null, found.null.average)
+    return [v.entry() for v in seen if v.reason is None]
+
+
+def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
+    """Return the smallest visible size of every effect at every place, by effect and place.
+
+    `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
+    metric = Rows(Plain(case, null, ROWS), average, True)
+    rig = Structure(null.rough_plant, metric.drives, [t.columns for t in case.tables])
+    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    found = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
+    columns = (column for c in found for g in groups_of(c, metric) for column in g.columns())
+    return _best(_norms(metric, at, columns))
+
+
+def sized(effect: Effect) -> bool:
+    """Return whether an effect has a size. A limit of a drive, a reading or a level has none."""
+    return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
+
+
+def _best(norms: Iterable[Norms]) -> list[Visible]:
+    """Return the most visible size of each effect at each place."""
+    best: dict[tuple[str, str], Visible] = {}
+    for n in norms:
+        new = _visible(n.column, n.whole, n.left)
+        old = best.get(new.candidate.key)
+        if old is None or (new.reason is not None, new.smallest) < (old.reason is not None, old.smallest):
+            best[new.candidate.key] = new
+    return [best[key] for key in sorted(best)]
+
+
+def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterator[Norms]:
+    for part, plain in directions(metric, at, columns):
+        rows = plain * metric.weight[:, None]
+        full = np.linalg.norm(rows, axis=0)
+        left = np.linalg.norm(metric.project(rows), axis=0)
+        for column, whole, size in zip(part, full, left, strict=True):
+            yield Norms(column, float(whole), float(size))
+
+
+def _visible(column: Column, full: float, left: float) -> Visible:
+    c, _, (shape, dim), _ = column.item
+    sizes = [p for p in c.effect.parameters if p.amplitude]
+    if full < STILL:
+        return Visible(c, "", None, np.inf, NOT_EXCITED)
+    if left < ABSORBED * full:
+        return Visible(c, "", None, np.inf, IMITATED)
+    if sizes:
+        absent = parameter_values(c, shape, [0.0 for _ in dim])
+        found = parameter_values(c, shape, [SEEN / left * v for v in dim])
+        p = next(p for p in sizes if found[p.name] != absent[p.name])
+        smallest, most = abs(found[p.name] - absent[p.name]), max(abs(np.array(c.bounds(p)) - absent[p.name]))
+        return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if smallest > most else None)
+    # A lag, delay or dead zone: near a value on the grid the outputs change in proportion to it.
+    p = next(p for p in c.effect.parameters if p.shape)
+    smallest = column.item[2][0][str(p.shape)] * max(SEEN / left, 1 / NEAR)
+    return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if left < SEEN else None)
+
+
+def _unit(c: Candidate, parameter: str) -> str | None:
+    return c.extend({}).parameters[c.own(parameter)].unit

@@ -1,0 +1,387 @@
+"""The diagnosis as one object, and as the JSON of its contract (thermoctl-diagnosis/1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed
+from thermoctl.diagnosis.evidence.held_out import Worth
+from thermoctl.diagnosis.evidence.levels import late
+from thermoctl.diagnosis.evidence.unknown import Left
+from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.refit import PlacedLaw
+from thermoctl.diagnosis.law.result import law_entry
+from thermoctl.diagnosis.law.smooth import flow_unit
+from thermoctl.diagnosis.search.beam import Searched
+from thermoctl.diagnosis.verdict.decide import Decision, Posterior
+from thermoctl.diagnosis.verdict.misfit import Energy, standouts
+from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
+from thermoctl.plant.refit import Fit
+from thermoctl.plant.simulate import SimulationError, compile_plant
+
+MOVES = 6.0  # of its noise: least spread of an output that moves
+FOLLOWS = (
+    0.3  # of an output's variance: most that a plant of the right rig leaves, even where it lacks physics
+)
+MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
+UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
+BLOCKS, LARGE = (
+    40,
+    1.5,
+)  # of a recording; a block's rms over that of the recording, from which its misfit is large
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that was found.
+
+    - `best`: the leading hypothesis; `null`: the plant without any effect, after an ordinary refit
+    - `left`, `before`: the residual of `best` and of `null`
+    - `energy`: of each hypothesis' residuals
+    - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
+      probability of being physics
+    - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
+    - `asked`: probability that an effect predicts what it was not fitted to, of those that would be named
+    - `missing_flow`: rms of the flow into `before.node` that would close the misfit, where nothing is shown
+    - `law`: a law among the findings"""
+
+    case: Case
+    searched: Searched
+    posterior: Posterior
+    best: Fitted
+    null: Fitted
+    left: Left
+    before: Left
+    worth: Worth
+    decision: Decision
+    energy: Mapping[frozenset[Key], Energy]
+    physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    unknown: str
+    asked: Mapping[Key, float]
+    missing_flow: float | None = None
+    law: Law | None = None
+
+    @property
+    def shown(self) -> tuple[Placed, ...]:
+        """The effects that the result reports as findings."""
+        effects = [e for e in self.best.hypothesis.effects if not isinstance(e, PlacedLaw)]
+        if self.decision.verdict == "ambiguous":
+            return tuple(effects)
+        return tuple(e for e in effects if e.key in self.decision.named)
+
+    @property
+    def refused(self) -> frozenset[Key]:
+        """Return the effects that would be named, and that nothing else confirms."""
+        return frozenset(self.asked) - {*self.decision.named}
+
+    @property
+    def extends(self) -> bool:
+        """Return whether the outcome is the plant with something that it lacked."""
+        return bool(self.shown) or self.law is not None
+
+    @property
+    def final(self) -> Fitted:
+        """The hypothesis that the result shows as the outcome."""
+        return self.best if self.extends else self.null
+
+    @property
+    def remainder(self) -> Left:
+        """The residual of the outcome."""
+        return self.left if self.extends else self.before
+
+    @property
+    def extended(self) -> Plant:
+        """The plant with the findings and the law, refitted."""
+        return self.final.plant
+
+
+def contract(d: Diagnosis) -> dict[str, Any]:
+    """Return thermoctl-diagnosis/1; `next_experiment`, `not_seen` and `seconds` are still empty."""
+    keys = {e.key for e in d.shown}
+    stays = d.law is not None or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
+    outputs = d.case.plant.outputs
+    return _plain(
+        {
+            "format": "thermoctl-diagnosis/1",
+            "verdict": d.decision.verdict,
+            "findings": [_finding(d, e) for e in d.shown],
+            "alternatives": [
+                {"effect": e, "where": w, "probability": round(p, 4)}
+                | ({"why_not": UNCONFIRMED} if (e, w) in d.refused else {})
+                for (e, w), p in d.decision.alternatives
+                if (e, w) not in keys
+            ],
+            "mismatch": _mismatch(d),
+            "remainder": {
+                "share_closed": d.worth.share_closed if d.extends else 0.0,
+                "rms": d.remainder.rms,
+                "over_noise": d.remainder.over_noise,
+                "node": d.remainder.node,
+                "follows": d.remainder.follows,
+                "law": law_entry(d.law, d.worth),
+            }
+            if stays
+            else None,
+            "fit": {
+                "before": _as_it_came(d),
+                "refit_only": d.null.fit.rms(),
+                "after": d.final.fit.rms(),
+                "converged": d.null.fit.converged and d.final.fit.converged,
+                "held_out_before": d.worth.before,
+                "held_out_refit_only": d.worth.refit_only,
+                "held_out_after": d.worth.after if d.extends else d.worth.refit_only,
+                "held_out": "recordings " + ", ".join(d.worth.names)
+                if d.worth.reserved
+                else "cross-validated: too few recordings to set one aside",
+            },
+            "next_experiment": None,
+            "decision": {"row": d.decision.row, **d.decision.numbers},
+            "hypotheses": _hypotheses(d),
+            "lost": _lost(d),
+            "refused": [
+                {"effects": [f"{e} at {at}" for e, at in sorted(keys)], "reason": why}
+                for keys, why in d.searched.refused.items()
+            ],
+            "promised": {f"{e} at {at}": gain for (e, at), gain in sorted(d.searched.promised.items())},
+            "not_seen": [],
+            "truncated": d.searched.truncated,
+            "notes": _notes(d),
+            "outputs": {o: {"unit": outputs[o].unit, "noise": s} for o, s in d.before.noise.items()},
+            "seconds": None,
+        }
+    )
+
+
+def _notes(d: Diagnosis) -> list[str]:
+    """Return the assumptions and the cautions, as sentences."""
+    unnamed = [e.key for e in d.final.hypothesis.effects if e not in d.shown and not isinstance(e, PlacedLaw)]
+    return [
+        *d.case.notes,
+        *doubts(d.case, d.final.fit, d.before.noise),
+        *late(d.case, d.final),
+        *unfinished(d.null, d.final),
+        *filter(None, [d.unknown]),
+        *(
+            f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
+            f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"
+            for effect, where in unnamed
+        ),
+        *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
+    ]
+
+
+def unfinished(*fits: Fitted) -> list[str]:
+    """Return a sentence for each hypothesis whose refit ended by its limit, below its maximum."""
+    names = {
+        ", ".join(f"{e} at {at}" for e, at in sorted(f.hypothesis.keys)) or "the plant without effects": f.fit
+        for f in fits
+        if not f.fit.converged
+    }
+    return [
+        f"the refit of {name} ended after {fit.iterations} steps below its maximum; another promised {0.5 * fit.left:.2g} nats: "
+        "its probability may be too small"
+        for name, fit in names.items()
+    ]
+
+
+def doubts(case: Case, fit: Fit, noise: Mapping[str, float]) -> list[str]:
+    """Return doubts that the recordings suit the plant: nothing moves, or the errors are very large."""
+    model = fit.model
+    drives = case.drives(model)
+    recorded = np.concatenate([x.y for x in drives])
+    spread = {
+        o: float(np.nanquantile(recorded[:, j], 0.98) - np.nanquantile(recorded[:, j], 0.02))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(recorded[:, j]).any()
+    }
+    moves = any(spread[o] > MOVES * s for o, s in noise.items())
+    if not moves and not any(np.ptp(x.u, axis=0).any() for x in drives):
+        return [
+            "no input changes and no output moves: almost nothing is excited, so almost nothing could be seen; "
+            "record a run with changing inputs"
+        ]
+    rms, out = fit.rms(), []
+    for j, o in enumerate(model.outputs):
+        if o in spread and spread[o] > MOVES * noise[o]:
+            swing = float(np.nanstd(recorded[:, j]))
+            if rms[o] ** 2 > FOLLOWS * swing**2:
+                out.append(
+                    f"the plant follows {o} only roughly (error {rms[o]:.3g}, standard deviation of the reading {swing:.3g}): "
+                    "check that the recording is of this rig, in the plant's units, on one clock"
+                )
+    return out
+
+
+def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
+    plant, effect = d.best.plant, e.candidate.effect
+    values = {n: plant.parameters[n] for n in e.own.values()}
+    ends = {p.shape: plant.parameters[e.own[p.name]].value for p in effect.parameters if p.name in e.own}
+    last = max(float(t.t[-1] - t.t[0]) for t in d.case.tables)
+    first = ends.get("onset", ends.get("start"))
+    equation = _equation(plant, e)
+    figures = ", ".join(f"{n} = {p.value:.4g} {p.unit or ''}".strip() for n, p in values.items())
+    return {
+        "effect": e.key[0],
+        "where": e.key[1],
+        "when": None if first is None else [[first, min(ends.get("end", last), last)]],
+        "probability": round(d.posterior.effects.get(e.key, 0.0), 4),
+        "confirmed": round(d.asked.get(e.key, 1.0), 4),
+        "equation": equation,
+        "parameters": {
+            n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
+        },
+        "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
+    }
+
+
+def _equation(after: Plant, e: Placed) -> str:
+    """Return the expression that the effect brings or changes."""
+    mine = set(e.own.values())
+    for f in reversed(list(after.flows.values())):
+        if ex.names(f.rate) & mine:
+            return str(f.rate)
+    for o in after.outputs.values():
+        if ex.names(o.value) & mine:
+            return str(o.value)
+    for n in after.nodes.values():
+        if ex.names(n.storage) & mine:
+            net = " ".join(
+                f"{'+' if f.target == n.name else '-'} ({f.rate})"
+                for f in after.flows.values()
+                if n.name in (f.source, f.target)
+            )
+            return f"{n.storage} * d({n.name})/dt = {net.removeprefix('+ ')}"
+    return e.candidate.effect.title
+
+
+def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
+    if d.decision.verdict == "consistent":
+        return []
+    rms = d.null.fit.rms()
+    found = [
+        {
+            "channel": o,
+            "rms": rms[o],
+            "expected_rms": d.before.noise[o],
+            "node": d.before.node,
+            "missing_flow_rms": d.missing_flow,
+            "missing_flow_unit": flow_unit(d.case.plant, d.before.node) if d.before.node else None,
+            "when": _when(d, o),
+            "follows": d.before.follows,
+        }
+        for o, ratio in d.before.over_noise.items()
+        if ratio > MISFIT
+    ]
+    return sorted(found, key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
+
+
+def _when(d: Diagnosis, output: str) -> list[list[float]]:
+    """Return the intervals, s, in which an output's error is large, in the recording where it is largest."""
+    j = d.null.fit.model.outputs.index(output)
+    errors = [e[:, j] for e in d.null.fit.residuals]
+    sizes = [float(np.nanmean(e**2)) if np.isfinite(e).any() else 0.0 for e in errors]
+    r = int(np.argmax(sizes))
+    # the samples are about evenly spaced, so that a block of samples is a block of time
+    edges = np.linspace(0, len(errors[r]), min(BLOCKS, len(errors[r])) + 1).astype(int)
+    t = d.case.tables[r].t - d.case.tables[r].t[0]
+    out: list[list[float]] = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        part = errors[r][a:b]
+        if np.isfinite(part).any() and np.nanmean(part**2) > LARGE**2 * sizes[r]:
+            start, end = float(t[a]), float(t[min(b, len(t) - 1)])
+            if out and out[-1][1] == start:
+                out[-1][1] = end
+            else:
+                out.append([start, end])
+    return out
+
+
+def _as_it_came(d: Diagnosis) -> dict[str, float]:
+    """Return the rms error of the plant with the parameters of its file."""
+    model = compile_plant(d.case.plant)
+    try:
+        errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
+    except SimulationError:
+        return dict.fromkeys(model.outputs, float("nan"))
+    return {
+        o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))
+        for j, o in enumerate(model.outputs)
+        if np.isfinite(errors[:, j]).any()
+    }
+
+
+def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
+    """Return every hypothesis that was fitted, the likeliest first.
+
+    `physics`: each effect's probability to be no unnamed misfit; null where none stands out of it.
+    `remainder`: the largest probability of a remainder at an output."""
+    tried = d.searched.tried
+    null = next(w.fitted.log_evidence for w in tried if not w.fitted.hypothesis.effects)
+    out = []
+    for w in tried:
+        keys = w.fitted.hypothesis.keys
+        physics = d.physics.get(keys)
+        out.append(
+            {
+                "effects": [f"{e} at {at}" for e, at in sorted(keys)],
+                "log_evidence": w.fitted.log_evidence - null,
+                "log_prior_odds": w.log_odds,
+                "posterior": d.posterior.hypotheses.get(keys, 0.0),
+                "physics": None if physics is None else [physics[k] for k in sorted(keys)],
+                "remainder": max(w.fitted.average.remainder),
+                "rms": w.fitted.fit.rms(),
+                "cost": w.fitted.rough.cost,
+                "at_bound": w.fitted.fit.at_bound,
+                "converged": w.fitted.fit.converged,
+                "energy": list(d.energy[keys].squares),
+                "misfit": list(d.energy[keys].misfit),
+                "rows": list(d.energy[keys].rows),
+                "dims": [len(e.own) for e in sorted(w.fitted.hypothesis.effects, key=lambda e: e.key)],
+            }
+        )
+    return sorted(out, key=lambda h: -h["posterior"])  # the order of scores stays among the unlikely
+
+
+def _lost(d: Diagnosis) -> list[dict[str, Any]]:
+    """Return the fitted effects that are no finding, each in its best hypothesis, with the reason."""
+    out: dict[Key, dict[str, Any]] = {}
+    shown = {e.key for e in d.shown}
+    final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
+    for w in d.searched.tried:
+        keys = w.fitted.hypothesis.keys
+        for key in sorted(keys - shown):
+            if key not in out:
+                beside = sorted(f"{e} at {at}" for e, at in keys - {key})
+                out[key] = {
+                    "effect": key[0],
+                    "where": key[1],
+                    "beside": beside,
+                    "probability": d.posterior.effects.get(key, 0.0),
+                    "below_best": final - w.score,
+                    "reason": UNCONFIRMED
+                    if key in d.refused
+                    else "less likely than the findings"
+                    if key in standouts(d.physics.get(keys, {}))
+                    else "does not stand out of the misfit that it leaves",
+                }
+    return sorted(out.values(), key=lambda e: (-e["probability"], e["below_best"]))
+
+
+def _plain(value: Any) -> Any:
+    """Convert to JSON's own types; NaN and infinity become null, numbers are rounded to ten digits."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.bool_ | bool):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.10g}") if np.isfinite(value) else None
+    return int(value) if isinstance(value, np.integer) else value

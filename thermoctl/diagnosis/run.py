@@ -1,0 +1,174 @@
+"""Diagnose recordings and write diagnosis.json, plant.yaml, report.html and the next experiment."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import json
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.data import memory
+from thermoctl.diagnosis.evidence.fit import remembered
+from thermoctl.diagnosis.experiment import file as experiment_file
+from thermoctl.diagnosis.experiment.design import NONE, Limits
+from thermoctl.diagnosis.experiment.propose import propose
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import limits as numbers
+from thermoctl.diagnosis.report.page import write_report
+from thermoctl.diagnosis.report.trend import earlier_trends, told, trends
+from thermoctl.diagnosis.report.unseen import not_seen
+from thermoctl.diagnosis.report.words import words
+from thermoctl.diagnosis.result import Diagnosis, contract
+from thermoctl.diagnosis.threads import one_thread
+from thermoctl.extras import lacking
+from thermoctl.plant import load, save
+from thermoctl.plant.language import Plant
+from thermoctl.plant.recordings import read_recordings
+from thermoctl.plant.simulate import SimulationError
+from thermoctl.recording.table import Table
+from thermoctl.report.page import page
+from thermoctl.safe_file import whole_files, write_text
+from thermoctl.yamlfile import InputError
+
+STOPPED = (
+    "stopped by hand after {} refits: probabilities compare the hypotheses that were tried; what was not tried may be "
+    "likelier; diagnose again for the whole search"
+)
+
+
+@one_thread()
+def diagnose(
+    plant: Plant,
+    tables: Sequence[Table],
+    out: str | Path,
+    effects: Sequence[Path] = (),
+    held_out: Sequence[Table] = (),
+    progress: Callable[[str], None] | None = None,
+    drivable: Sequence[str] = (),
+    limits: Limits = NONE,
+    stopped: Callable[[], bool] = lambda: False,
+    earlier: Path | None = None,
+    report: bool = True,
+) -> dict[str, Any]:
+    """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
+
+    - `effects`: folders of effects beside the catalogue
+    - `held_out`: recordings that take no part in any choice
+    - `drivable`: inputs that the next experiment may drive (default: those that changed)
+    - `limits`: ranges of inputs and outputs in the next experiment
+    - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
+    - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
+    - `report`: write report.html, too
+
+    Raises InputError for unusable inputs."""
+    if not tables:
+        raise InputError("no recording was given; one or more were expected")
+    started, folder = time.monotonic(), writable(Path(out))
+    named = _distinct([*tables, *held_out])
+    chosen_on, reserve = named[: len(tables)], named[len(tables) :]
+    before, sizes = memory.read(earlier, plant) if earlier else memory.Memory(), earlier_trends(earlier)
+    if again := {t.name for t in named} & set(before.recordings):
+        raise InputError(
+            f"{earlier}: holds {', '.join(sorted(again))} already; recordings that it has not seen were expected"
+        )
+    try:
+        found = engine.diagnose(
+            plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress, stopped, before
+        )
+    except SimulationError as e:
+        raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
+    proposed = None if stopped() else propose(found, drivable, limits, progress)
+    result = contract(found)
+    result["next_experiment"] = proposed[0] if proposed else None
+    result["trends"] = trends(found.case, found.best, found.shown, sizes)
+    result["notes"] += told(result["trends"])
+    if before.recordings:
+        result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")
+    if stopped():
+        result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
+    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
+    result["seconds"] = round(time.monotonic() - started, 1)
+    _write(folder, plant, found, result, proposed, report)
+    return result
+
+
+def _write(
+    folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any, report: bool
+) -> None:
+    """Write all files of a result, or none."""
+    with whole_files(folder, remove=experiment_file.FILES) as part:
+        added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
+        save(found.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
+        load(part / "plant.yaml")
+        if report:
+            _report(found, result, part / "report.html")
+        write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+        memory.write(part, plant, _remembered(found))
+        if proposed:
+            experiment_file.write(part, found.case, *proposed)
+
+
+def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
+    """Write report.html; without matplotlib only the summary, with a note in the result."""
+    try:
+        write_report(found, result, path)
+    except ModuleNotFoundError as e:
+        if (line := lacking(e)) is None:
+            raise
+        result["notes"].append(f"report.html without figures and tables: {line}")
+        summary = html.escape(f"{words(result)} {result['notes'][-1]}")
+        write_text(path, page("Diagnosis", [("", f"<p>{summary}</p>")]))
+
+
+def _remembered(found: Diagnosis) -> memory.Memory:
+    """Return what is kept for a diagnosis that goes on: the likeliest hypotheses, and that of no effect."""
+    kept = [
+        w.fitted
+        for k, w in enumerate(found.searched.tried)
+        if k < memory.KEPT or not w.fitted.hypothesis.effects
+    ]
+    names = (*found.case.memory.recordings, *(t.name for t in found.case.tables))
+    return memory.Memory(tuple(remembered(found.case, f) for f in kept), names)
+
+
+def diagnose_files(
+    plant_file: str | Path,
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    effects: Sequence[Path] = (),
+    held_out: Sequence[str | Path] = (),
+    report: bool = True,
+) -> dict[str, Any]:
+    """Diagnose recordings that are named by their files. Raises InputError."""
+    plant = load(plant_file)
+    tables, reserve = read_recordings(plant, recordings), read_recordings(plant, held_out)
+    return diagnose(plant, tables, out, effects, reserve, report=report)
+
+
+def writable(folder: Path) -> Path:
+    """Return the folder of a result, if files can be written there; else InputError before the work."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: a file; a folder for the result was expected (--out)")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder if folder.exists() else folder.parent):
+            pass
+    except OSError as e:
+        raise InputError(
+            f"{folder}: the result cannot be written there: {e.strerror}; give another --out"
+        ) from None
+    return folder
+
+
+def _distinct(tables: Sequence[Table]) -> list[Table]:
+    """Return the tables with names that differ: that of the folder is put before a name that comes twice."""
+    names = [t.name for t in tables]
+    return [
+        t if names.count(t.name) == 1 else dataclasses.replace(t, name=f"{Path(t.path).parent.name}_{t.name}")
+        for t in tables
+    ]

@@ -1,0 +1,434 @@
+"""A beam of hypotheses, grown by the score test, compared by log evidence and prior odds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Budget, Case
+from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
+from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
+from thermoctl.diagnosis.evidence.levels import only_noise
+from thermoctl.diagnosis.evidence.odds import odds
+from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.search.extend import extend, sticking, weaker
+from thermoctl.diagnosis.search.gains import Direction
+from thermoctl.diagnosis.search.mistakes import mistakes
+from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
+from thermoctl.diagnosis.search.screen import Norms, sharpened
+from thermoctl.diagnosis.search.screening import Screened, places, screened
+from thermoctl.diagnosis.search.shortlist import HALF, PAIR, shortlist, simpler
+from thermoctl.plant import expression as ex
+from thermoctl.plant import refit
+from thermoctl.plant.cores import LEAST, batches, each
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.yamlfile import InputError
+
+INSIGNIFICANT = "refitted, and it or a part of it is not significant"
+FAILED = "its refit could not be simulated"
+SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
+BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
+# Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
+CLOSE = 0.5
+Keys = frozenset[Key]
+Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their promised gain
+START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A fitted hypothesis and its log prior odds."""
+
+    fitted: Fitted
+    log_odds: float
+
+    @property
+    def score(self) -> float:
+        """Log p(D | h) + log p(h)"""
+        return self.fitted.log_evidence + self.log_odds
+
+
+@dataclass(frozen=True)
+class Searched:
+    """All hypotheses tried, best first; whether the budget ended the search.
+
+    `norms`: of all columns in the screening without effects; empty where not all were screened.
+    `seen`: hypotheses that were extended; `where`: the places where each effect fits. `promised`: the
+    largest first-order gain of a placed effect, nats; `refused`: refits that are no hypotheses, and why."""
+
+    tried: tuple[Weighed, ...]
+    truncated: bool
+    norms: Sequence[Norms] = ()
+    seen: frozenset[Keys] = frozenset()
+    where: Mapping[str, set[str]] = field(default_factory=dict)
+    promised: Mapping[Key, float] = field(default_factory=dict)
+    refused: Mapping[Keys, str] = field(default_factory=dict)
+
+
+@dataclass
+class Search:
+    """A search under way: where each effect fits, hypotheses by their effects, and those already extended."""
+
+    case: Case
+    limits: Limits
+    where: Mapping[str, set[str]]
+    tried: dict[Keys, Weighed] = field(default_factory=dict)
+    seen: set[Keys] = field(default_factory=set)
+    norms: list[Norms] = field(default_factory=list)  # of the screening without effects
+    refitted: set[Keys] = field(default_factory=set)  # extensions, kept or not: none is refitted twice
+    promised: dict[Key, float] = field(default_factory=dict)  # largest first-order gain of a placed effect
+    refused: dict[Keys, str] = field(default_factory=dict)  # refits that are no hypotheses: why
+
+    @property
+    def best(self) -> Weighed:
+        """Return the likeliest hypothesis so far."""
+        return max(self.tried.values(), key=lambda w: w.score)
+
+    def keep(self, found: Iterable[Weighed]) -> None:
+        """Add hypotheses; of two refits of one the likelier stays."""
+        for w in found:
+            keys = w.fitted.hypothesis.keys
+            if keys not in self.tried or w.score > self.tried[keys].score:
+                self.tried[keys] = w
+
+    def extended(self, parent: Weighed) -> list[Weighed]:
+        """Extend a hypothesis, once."""
+        if parent.fitted.hypothesis.keys in self.seen:
+            return []
+        if self.case.budget.spent:
+            self.case.budget.untried += 1
+            return []
+        self.seen.add(parent.fitted.hypothesis.keys)
+        self.case.budget.screen()
+        looked = screened(self.case, parent.fitted, self.limits)
+        if not parent.fitted.hypothesis.effects:
+            self.norms = looked.norms
+        for d, gain in zip(looked.directions, looked.promises, strict=True):
+            self.promised[d.candidate.key] = max(gain, self.promised.get(d.candidate.key, 0.0))
+        found = extensions(self, parent, looked)
+        self.keep(found)
+        return found
+
+    def weighed(self, f: Fitted) -> Weighed:
+        """Return a refit with its prior odds."""
+        return Weighed(f, odds(f.hypothesis.effects, self.where, self.limits))
+
+
+def search(case: Case, limits: Limits) -> Searched:
+    """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
+
+    Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
+    searched with an observer, too."""
+    s = started(case, limits)
+    null = s.best
+    rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
+    if rivals:
+        s.keep(rivals)
+        s.extended(null)  # also where a rival fits better
+    grow(s)
+    swap(s)
+    if with_observer(s):
+        grow(s)
+        swap(s)
+    return searched(s)
+
+
+def searched(s: Search) -> Searched:
+    """Return the result of a search."""
+    order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
+    refused = {keys: why for keys, why in s.refused.items() if keys not in s.tried}
+    return Searched(
+        order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
+    )
+
+
+def started(case: Case, limits: Limits) -> Search:
+    """Return a search that holds the plant without effects."""
+    s = Search(case, limits, places(case))
+    s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
+    recall(s)
+    return s
+
+
+def grow(s: Search) -> None:
+    """Extend the beam until none of its extensions is better."""
+    for number in range(s.limits.effects):
+        beam = leaders(list(s.tried.values()), s.limits)
+        best = beam[0].score
+        close = only_noise(s.case, beam[0].fitted, s.limits)
+        rounds = s.limits.effects - number - 1
+        for k, parent in enumerate(beam):
+            after = [w for w in beam[k + 1 :] if not close or w.score >= best - BEATEN]
+            follows = (
+                s.limits.beam if len(s.tried) == 1 and rounds else 0
+            )  # beside the plant alone none is known
+            s.case.budget.later = (
+                CLOSE * (len(after) + follows) if close else len(after) + rounds * s.limits.beam
+            )
+            if close and parent.score < best - BEATEN:
+                continue
+            known = parent.fitted.hypothesis.keys in s.seen
+            if not s.extended(parent) and parent is beam[0] and not known:
+                break  # the best cannot be extended: no rival with more effects is needed
+        if s.best.score <= best or s.case.budget.spent:
+            break
+
+
+def swap(s: Search) -> None:
+    """Leave out each effect of the best hypothesis in turn, and extend the rest, until none replaces it.
+
+    So each effect meets its rivals beside the same others, whichever way the beam took. The rest itself is
+    refitted without regard to the budget: misfit.py compares the effect with it."""
+    while True:
+        best = s.best
+        effects = best.fitted.hypothesis.effects
+        for e in effects if len(effects) > 1 else ():
+            rest = tuple(o for o in effects if o is not e)
+            if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
+                continue
+            parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
+            if parent is None:
+                continue
+            if not parent.fitted.doubtful:
+                s.keep([parent])
+            s.extended(parent)
+        if s.best is best:
+            return
+
+
+def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
+    """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails.
+
+    It fails for a law: the catalogue has no place for it."""
+    case, known = s.case, values.rough_plant
+    if any(e.key[0] not in case.catalogue for e in effects):
+        return None
+    parameters = {n: known.parameters.get(n, p) for n, p in case.plant.parameters.items()}
+    plant = dataclasses.replace(case.plant, parameters=parameters)
+    entries = {e.key[0]: e.candidate.effect for e in effects}
+    return remade(s, placed_before(effects, known), plant, entries, leader)
+
+
+def remade(
+    s: Search,
+    effects: Sequence[PlacedBefore],
+    plant: Plant,
+    entries: Mapping[str, Effect],
+    leader: Fitted | None,
+) -> Weighed | None:
+    """Refit a plant with effects of an earlier hypothesis, from their values; None where this fails.
+
+    Each place is looked up again: its expressions may have held an effect that is not there now."""
+    case, placed = s.case, tuple[Placed, ...]()
+    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
+    try:
+        for e in effects:
+            found = candidates(Structure(plant, drives, columns), entries)
+            c = next(c for c in found if (c.key, c.label) == (e.key, e.label))
+            inputs = plant.inputs.keys()
+            plant = c.extend(e.values, e.ranges)
+            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
+                drives = case.drives(compile_plant(plant))
+            placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
+        return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
+    except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
+        return None
+
+
+def with_observer(s: Search) -> bool:
+    """Search with a plant that follows its recordings, and refit its best hypotheses in the free run.
+
+    Only for a rig that drifts: there a free run from a wrong hypothesis leads no refit to the right one.
+    Return whether a hypothesis was found that the search had not."""
+    case = s.case
+    drives = case.drives(case.null.model)
+    about = linear(case.null, drives)
+    if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
+        return False
+    if only_noise(case, as_refitted(case, s.best.fitted), s.limits):
+        return False
+    known = len(s.tried)
+    for trust in TRUSTS:
+        plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
+        if plant is None:
+            break
+        try:
+            following = _following(s, plant)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue  # the plant with an observer cannot be simulated: the free search stands
+        for w in leaders(list(following.tried.values()), s.limits):
+            effects = w.fitted.hypothesis.effects
+            free = rebuilt(s, effects, w.fitted, None) if effects else None
+            if free and not free.fitted.absent:
+                s.keep([free])
+        if len(s.tried) > known:
+            break
+    return len(s.tried) > known
+
+
+def _following(s: Search, plant: Plant) -> Search:
+    """Return a search with a plant that follows its recordings. Raises SimulationError."""
+    case, model = s.case, compile_plant(plant)
+    null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
+    budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+    own = dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING)
+    following = started(own, s.limits)
+    grow(following)
+    return following
+
+
+def recall(s: Search) -> None:
+    """Refit the hypotheses of an earlier diagnosis to these recordings, from where they were."""
+    past = s.case.memory.hypotheses
+    likeliest = max((h.log_evidence for h in past), default=0.0)
+    for h in past:
+        far = h.log_evidence < likeliest - BEATEN * s.limits.effects
+        if h.effects and not far and not s.case.budget.spent:
+            leader = max((w.fitted for w in s.tried.values()), key=lambda f: f.log_likelihood)
+            found = remade(s, h.effects, s.case.plant, s.case.catalogue, leader)
+            if found:
+                s.keep([found])
+
+
+def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
+    """Return the beam: hypotheses in turn by score and by free-run error.
+
+    By error too: the remainder may absorb an effect that a later extension explains."""
+    ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
+    out: dict[Keys, Weighed] = {}
+    for pair in zip(*ranked, strict=True):
+        for w in pair:
+            out.setdefault(w.fitted.hypothesis.keys, w)
+    return list(out.values())[: limits.beam]
+
+
+def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
+    """Refit the parent with each direction, and with each pair of directions, of the shortlist.
+
+    A promise is the first-order gain. An extension that would not reach the leader with twice its promise is
+    left out. All promises are taken for too small by the largest `ratio` so far. Beside a leader that leaves
+    no more than noise only promises count."""
+    case, where, limits, tried = s.case, s.where, s.limits, s.tried
+    out: list[Weighed] = []
+    doubtful: list[Weighed] = []
+    quiet: dict[Keys, bool] = {}  # does a leader leave no more than noise?
+    queue, planned, ratio = shortlist(looked, where, limits), case.budget.later, 1.0
+
+    def wanted(item: Extension) -> bool:
+        """Return whether an extension is new and may win, and a refit is left."""
+        added, gain = item
+        keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
+        if keys in tried or keys in s.refitted or len(keys) > limits.effects:
+            return False
+        ahead = max([*tried.values(), *out], key=lambda w: w.score)
+        own = ahead.fitted.hypothesis.keys
+        if own not in quiet:
+            quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
+        if quiet[own] and np.isinf(gain):
+            return False
+        if parent.score + HALF * ratio * gain < ahead.score:
+            return False
+        case.budget.untried += case.budget.spent
+        if case.budget.spent:
+            return False
+        s.refitted.add(keys)
+        return True
+
+    for batch, left in batches(queue, wanted):
+        leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
+        untried = (left + len(batch)) / len(queue)
+        case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits, untried))
+        case.budget.planned = case.budget.fits_done + left + len(batch)
+        for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
+            found = [f for f in fits if not f.absent]
+            if np.isfinite(gain):
+                best_gain = max((f.log_evidence for f in fits), default=-np.inf) - parent.fitted.log_evidence
+                ratio = max(ratio, best_gain / max(gain, 1.0))
+            keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
+            s.refused[keys] = INSIGNIFICANT if fits else FAILED
+            if found:
+                best = max(found, key=lambda f: f.log_evidence)
+                w = Weighed(best, odds(best.hypothesis.effects, where, limits))
+                (doubtful if best.doubtful else out).append(w)
+            if any(f.absent or f.doubtful for f in fits):
+                queued = {d.candidate.key for ds, _ in queue for d in ds}
+                queue += [((d,), gain) for d in simpler(added, looked) if d.candidate.key not in queued]
+    simplest = max((w.score for w in (parent, *out)), default=parent.score)
+    return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
+
+
+def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits, untried: float) -> float:
+    """Return how many hypotheses the search will probably extend besides; it steers nothing.
+
+    `untried`: share of the shortlist."""
+    if not any(w.fitted.hypothesis.effects for w in tried):
+        return CLOSE * limits.beam * untried  # it may end with the next one, or extend every beam
+    if not only_noise(case, leader, limits):
+        return np.inf
+    scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
+    return CLOSE * sum(score >= scores[0] - BEATEN for score in scores)
+
+
+def _abreast(
+    case: Case, parent: Weighed, looked: Screened, batch: Sequence[Extension], leader: Fitted
+) -> list[list[Fitted]]:
+    """Return the refits of each of some extensions, which run side by side."""
+    starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
+    return each(lambda first: _followed(case, parent, looked, first, leader), starts, len(batch) * LEAST)
+
+
+def _followed(
+    case: Case, parent: Weighed, looked: Screened, first: Sequence[Direction], leader: Fitted
+) -> list[Fitted]:
+    """Refit the parent with the directions from several starting points, which depend on their shapes.
+
+    If every refit fits worse than the parent, start again from a weaker effect."""
+    stuck = tuple(sticking(d) or d for d in first)
+    found = [_refitted(case, parent, first, looked, leader)]
+    if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:
+        found.append(_refitted(case, parent, stuck, looked, leader))
+    if all(f is None or f.rough.cost > parent.fitted.rough.cost for f in found):
+        found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
+    return [f for f in found if f is not None]
+
+
+def _refitted(
+    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: Fitted
+) -> Fitted | None:
+    effects, plant = parent.fitted.hypothesis.effects, parent.fitted.rough_plant
+    drives = looked.metric.drives
+    try:
+        for d in added:
+            rig = Structure(plant, drives, [t.columns for t in case.tables])
+            d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
+            inputs = plant.inputs.keys()
+            plant, own = extend(plant, d, drives)
+            if not own:  # an effect before took its place, and it changes nothing
+                return None
+            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
+                drives = case.drives(compile_plant(plant))
+            effects = (*effects, Placed(d.candidate, own))
+        return fitted(case, free_starts(parent.fitted.plant, plant), effects, None, leader, parent.fitted)
+    except (SimulationError, InputError, np.linalg.LinAlgError):
+        return None
+
+
+def free_starts(before: Plant, after: Plant) -> Plant:
+    """Widen the initial states of bodies that an effect added: nobody measured where they start.
+
+    A node into which nothing flows is none: it holds a reading of the start."""
+    moving = {end for f in after.flows.values() if f.rate is not ex.ZERO for end in (f.source, f.target)}
+    nodes = {
+        n.name: n
+        if n.name in before.nodes or n.name not in moving or not n.initial_sigma
+        else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
+        for n in after.nodes.values()
+    }
+    return dataclasses.replace(after, nodes=nodes)

@@ -1,0 +1,105 @@
+"""A plant with a screened effect: the ranges of its parameters in a refit, and where the refit starts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.search.gains import Direction
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import Excitation
+
+# Factor by which dry friction of a refit may creep more slowly than in the screening. A second refit starts
+# there: an axis that sticks rests for long.
+STICKING = 300.0
+
+
+def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
+    """Return the ranges of the effect's parameters in a refit: physics' bounds, wide about the estimate."""
+    out = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name]
+        kind = direction.candidate.effect.shapes.get(p.shape or "", "")
+        if p.shape in ("onset", "start", "end"):
+            if value <= duration:
+                out[p.name] = (0.0, duration)
+            continue
+        if p.shape == "phase":
+            out[p.name] = (-8.0, 8.0)
+            continue
+        if p.shape == "period":
+            out[p.name] = (
+                0.75 * value,
+                max(value, min(1.33 * value, direction.shape.get("longest", np.inf))),
+            )
+            continue
+        if p.shape == "level":
+            reach = max(abs(value), 1e-9)
+            out[p.name] = (
+                (max(p.low, value - 3 * reach), value + 3 * reach)
+                if kind != "small_levels"
+                else (0.0, 5 * reach)
+            )
+            continue
+        if p.shape:
+            least = STICKING if kind == "creep_speeds" else 30
+            out[p.name] = (
+                (max(p.low, value / least), min(p.high, value * 30))
+                if kind != "delays"
+                else (0.0, max(value * 8, 0.05 * duration))
+            )
+            continue
+        floor, ceiling = direction.candidate.bounds(p)
+        if np.isfinite(floor) and np.isfinite(ceiling):
+            out[p.name] = (floor, ceiling)
+            continue
+        reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
+        low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
+        if p.name == "C" and value > 0:
+            low, high = value / 100, value * 100
+        out[p.name] = (low, high)
+    return {n: (float(low), float(high)) for n, (low, high) in out.items()}
+
+
+def weaker(direction: Direction, share: float = 0.1) -> Direction:
+    """Return the direction with a start at a `share` of its size."""
+    effect, start = direction.candidate.effect, dict(direction.start)
+    for p in effect.parameters:
+        if p.fades(effect.shapes):
+            start[p.name] = p.null + share * (start[p.name] - p.null)
+    return dataclasses.replace(direction, start=start)
+
+
+def sticking(direction: Direction) -> Direction | None:
+    """Return the direction with a start at dry friction that sticks; None for an effect without creep.
+
+    A refit does not find such friction from a faster creep."""
+    effect = direction.candidate.effect
+    start = {
+        p.name: direction.start[p.name] / STICKING
+        for p in effect.parameters
+        if effect.shapes.get(p.shape or "") == "creep_speeds"
+    }
+    return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
+
+
+def extend(base: Plant, direction: Direction, drives: Sequence[Excitation]) -> tuple[Plant, dict[str, str]]:
+    """Return the plant with a screened effect at its starting values, and the names of its parameters."""
+    duration = max(float(d.t[-1]) for d in drives)
+    ranges = ranges_of(direction, duration)
+    values: dict[str, float] = {}
+    for p in direction.candidate.effect.parameters:
+        value = direction.start[p.name] if p.typical is None else p.typical
+        if p.name in ranges:
+            low, high = ranges[p.name]
+            inside = 1e-4 * (high - low)
+            value = float(np.clip(value, low + inside, high - inside))
+        values[p.name] = value
+    plant = direction.candidate.extend(values, ranges)
+    return plant, {
+        p.name: direction.candidate.own(p.name)
+        for p in direction.candidate.effect.parameters
+        if direction.candidate.own(p.name) in plant.parameters
+    }

@@ -1,0 +1,291 @@
+"""The gain of an effect from its first-order change of the outputs, and the sizes at which it is largest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import gammaincc
+
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
+from thermoctl.plant import expression as ex
+
+PLACES_EACH = 3  # of an effect in a shortlist: one with many places leaves room for others
+DECADES = 3.0  # up and down from one unit: where quotients of amplitudes are looked for
+NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
+
+
+@dataclass
+class Direction:
+    """One candidate at one shape: how much it would explain and where its refit should start."""
+
+    candidate: Candidate
+    shape: dict[str, float]
+    gain: float
+    dims: int
+    start: dict[str, float]
+    vector: np.ndarray | None = None  # unit vector of the projected direction
+    excited: float = 0.0  # share of the direction that the plant's own parameters leave
+    elsewhere: float = 0.0  # log10 of how many shapes this one was picked from by the residual itself
+
+    @property
+    def log_p(self) -> float:
+        """log10 of the chance of such a gain where nothing is missing."""
+        return log_p(self.gain, self.dims) + self.elsewhere
+
+
+def once(directions: Iterable[Direction]) -> list[Direction]:
+    """Return the first direction of each candidate."""
+    first: dict[tuple[str, str], Direction] = {}
+    for d in directions:
+        first.setdefault(d.candidate.key, d)
+    return list(first.values())
+
+
+def foremost(directions: Iterable[Direction], places: int) -> list[Direction]:
+    """Return the directions at the first `places` places of each effect."""
+    seen: dict[str, set[str]] = {}
+    out = []
+    for d in directions:
+        effect, where = d.candidate.key
+        known = seen.setdefault(effect, set())
+        if where in known or len(known) < places:
+            known.add(where)
+            out.append(d)
+    return out
+
+
+def log_p(gain: float, dims: int) -> float:
+    """log10 of the chi-square tail, also where that is too small for a float."""
+    return float(_log_p(np.asarray(gain), dims))
+
+
+def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        value = np.log10(gammaincc(0.5 * dims, 0.5 * np.maximum(gain, 0.0)))
+    return np.where(
+        np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10))
+    )
+
+
+@dataclass(frozen=True)
+class Column:
+    """A direction to be built: an effect at one shape, along one of its amplitudes.
+
+    item = (candidate, group, (shape, dim), columns in the group); `scale`: over the amplitude in `values`."""
+
+    item: tuple[Any, ...]
+    overlay: Callable[[], Overlay]
+    values: Mapping[str, float]
+    scale: float
+
+    def changes(self, at: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+        """Return its forces by state and its changes of outputs along a trajectory, all numbers finite."""
+        try:
+            parts = self.overlay().changes(self.values, at)
+        except (KeyError, ex.ExpressionError):
+            return {}, {}
+        forces, outputs = (
+            {k: _finite(v * self.scale) for k, v in part.items() if np.any(v)} for part in parts
+        )
+        return forces, outputs
+
+
+def _finite(v: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
+    """The effect's parameters at amplitudes s and a shape."""
+    known = {
+        "s": s[0] if len(s) else 0.0,
+        **{f"s{k + 1}": v for k, v in enumerate(s) if k},
+        **shape,
+        "first_air": c.rig.first_air(c.rig.drives[0]),
+    }
+    out = {}
+    for p in c.effect.parameters:
+        if p.shape:
+            out[p.name] = float(shape.get(p.shape, p.null))
+        elif p.trial is not None:
+            value = float(ex.evaluate(p.trial, known))
+            out[p.name] = value if np.isfinite(value) else p.null
+        else:
+            out[p.name] = p.null
+    return out
+
+
+def score(
+    columns: Sequence[Column], rows: np.ndarray, g: np.ndarray, full: np.ndarray, best: dict[int, Direction]
+) -> None:
+    """Score the columns of one group, and keep their best direction if it is the candidate's best so far.
+
+    - `rows` (rows, k): projected; only their products count, so sketched ones will do
+    - `g` (k,): products with the residual; `full` (k,): norms of the whole rows"""
+    c, m = columns[0].item[0], rows.T @ rows
+    if "windows" in c.effect.shapes.values():
+        _score_windows(c, columns, rows, full, g, m, best)
+        return
+    left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
+    useful = (left > 1e-4) & (full > 1e-9)
+    if not useful.any():
+        return
+    scale = np.where(useful, np.sqrt(np.maximum(np.diag(m), 1e-300)), 1.0)
+    sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
+    coefficient = np.zeros(len(g))
+    inverse = 1 / sub if len(sub) == 1 else np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
+    inverse = inverse / np.outer(scale[useful], scale[useful])
+    coefficient[useful] = inverse @ g[useful]
+    shape, _ = columns[0].item[2]
+    if c.effect.prior is not None:
+        told = [q for q, u in zip(columns, useful, strict=True) if u]
+        coefficient[useful] = _plausible(c, told, coefficient[useful], inverse)
+    if len(g) == 1:
+        coefficient[0] = _within(c, columns[0], float(coefficient[0]))
+    gain = float(2 * g @ coefficient - coefficient @ m @ coefficient)
+    if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
+        gain = 0.0
+    shape, s = _sizes(c, columns, shape, coefficient)
+    _keep(
+        best,
+        Direction(c, shape, gain, int(useful.sum()), {}, None, float(left[useful].max())),
+        s,
+        lambda: rows @ coefficient,
+    )
+
+
+def _plausible(
+    c: Candidate, columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Return coefficients whose amplitudes are likely by the catalogue's prior, and fit as well as may be.
+
+    The other amplitudes are products with the first. Where the plant absorbs that one alone, the data leave
+    its size and its sign open, and only the prior of the others tells it."""
+    shape, _ = columns[0].item[2]
+    dims = np.array([q.item[2][1] for q in columns])  # (columns, amplitudes)
+    step = covariance @ dims[:, 0]
+    size, variance = float(dims[:, 0] @ coefficient), float(dims[:, 0] @ step)
+    typical, prior = float(np.abs(dims.T @ coefficient)[1:].max(initial=0.0)), c.effect.prior
+    if variance <= 0 or typical <= 0 or prior is None:
+        return coefficient
+    known = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
+
+    def at(log_size: float) -> np.ndarray:
+        """Return the coefficients (columns,) at a size of the first one."""
+        return np.asarray(coefficient + step * (np.exp(log_size) - size) / variance)
+
+    def surprise(log_size: float) -> float:
+        """Return -2 log of how likely the amplitudes are at a size, up to a constant."""
+        sizes = dims.T @ at(log_size)
+        values = {**parameter_values(c, shape, list(sizes)), **known}
+        unlikely = float(ex.evaluate(prior, values)) + 2 * (len(sizes) - 1) * log_size
+        return float((np.exp(log_size) - size) ** 2 / variance + unlikely)
+
+    reach = np.log(typical) + np.log(10.0) * np.array([-DECADES, DECADES])
+    return at(float(minimize_scalar(surprise, bounds=tuple(reach), method="bounded").x))
+
+
+def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
+    """Return whether the catalogue allows the size of a direction that has only one."""
+    amplitudes = [p for p in c.effect.parameters if p.amplitude]
+    shape, _ = column.item[2]
+    if amplitudes:
+        return _allowed(amplitudes[0], coefficient)
+    if "tau" in shape and (column.item[1] != (0,) or (c.jumps and not c.variant)):
+        # in proportion only from one lag of the grid to the next
+        return 1 / NEAR < coefficient < NEAR
+    return coefficient > 0
+
+
+def _within(c: Candidate, column: Column, coefficient: float) -> float:
+    """Return the coefficient of a direction that has only one, inside the bounds of its amplitude.
+
+    One of the wrong sign stays as it is: beside another effect the sign may turn (shortlist.pairs)."""
+    p = next((p for p in c.effect.parameters if p.amplitude), None)
+    if p is None:
+        return coefficient
+    shape, dim = column.item[2]
+    low, high = c.bounds(p)
+    at = parameter_values(c, shape, [coefficient * v for v in dim])[p.name]
+    beyond = float(np.clip(at, low, high)) - p.null
+    return coefficient * beyond / (at - p.null) if beyond * (at - p.null) > 0 else coefficient
+
+
+def _sizes(
+    c: Candidate, columns: Sequence[Column], shape: dict[str, float], coefficient: np.ndarray
+) -> tuple[dict[str, float], list[float]]:
+    """Return the shape and the amplitudes at the best coefficients of the columns."""
+    if "phases" in c.effect.shapes.values():
+        phase = float(np.arctan2(coefficient[1], coefficient[0]))
+        return {**shape, "phase": phase}, [float(np.hypot(*coefficient))]
+    if any(p.amplitude for p in c.effect.parameters):
+        return shape, list(np.array([q.item[2][1] for q in columns]).T @ coefficient)
+    factor = float(np.clip(coefficient[0], 1e-3, 5.0))  # a short lag changes the outputs in proportion
+    return {k: v * factor if k == "tau" else v for k, v in shape.items()}, [1.0]
+
+
+def _score_windows(
+    c: Candidate,
+    columns: Sequence[Column],
+    rows: np.ndarray,
+    full: np.ndarray,
+    g: np.ndarray,
+    m: np.ndarray,
+    best: dict[int, Direction],
+) -> None:
+    """Keep the best pair of a start and an end; an end beyond the last column is that of the recording."""
+    edges = [q.item[2][0]["start"] for q in columns]
+    last, floor = len(edges), 1e-12 * float(full.max()) ** 2
+    gain, at = -1.0, (0, 0, 0.0)
+    for a in range(last):
+        for b in range(a + 1, last + 1):
+            top = g[a] - g[b] if b < last else g[a]
+            bottom = m[a, a] + m[b, b] - 2 * m[a, b] if b < last else m[a, a]
+            if bottom > floor and top * top / bottom > gain:
+                gain, at = top * top / bottom, (a, b, top / bottom)
+    if gain < 0:
+        return
+    a, b, amplitude = at
+    # Heat that ends and a lack of heat that starts differ by a constant, which parameters absorb.
+    # The lack is likelier.
+    if a == 0 and b < last and m[b, b] > floor and g[b] ** 2 / m[b, b] > 0.8 * gain:
+        a, b, amplitude = b, last, g[b] / m[b, b]
+        gain = g[a] ** 2 / m[a, a]
+    shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
+    vector = rows[:, a] - (rows[:, b] if b < last else 0)
+    excited = float(np.linalg.norm(vector)) / max(full[a], 1e-300)
+    _keep(best, Direction(c, shape, gain, 1, {}, None, excited), [amplitude], lambda: vector)
+
+
+def _allowed(p: EffectParameter, coefficient: float) -> bool:
+    assert p.trial is not None  # an amplitude has one
+    at = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
+    return (
+        p.low - 1e-12 <= at <= p.high + 1e-12
+        or (p.low < p.null < p.high)
+        or (coefficient > 0 if p.low >= p.null else coefficient < 0 if p.high <= p.null else True)
+    )
+
+
+def _keep(
+    best: dict[int, Direction], new: Direction, sizes: Sequence[float], along: Callable[[], np.ndarray]
+) -> None:
+    """Keep a direction if it is its candidate's best so far. Only then `along` computes its rows."""
+    shape = {k: v for k, v in new.shape.items() if k != "picked_from"}
+    new = dataclasses.replace(new, elsewhere=float(np.log10(new.shape.get("picked_from", 1.0))))
+    old = best.get(id(new.candidate))
+    if old is None or new.log_p < old.log_p:
+        vector = along()
+        size = float(np.linalg.norm(vector))
+        best[id(new.candidate)] = dataclasses.replace(
+            new,
+            shape=shape,
+            start=parameter_values(new.candidate, new.shape, sizes),
+            vector=(vector / size).astype(np.float32) if size > 0 else None,
+        )

@@ -1,0 +1,77 @@
+"""Rivals of every effect: a number that the plant file fixes is off by a factor.
+
+A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
+mass. The entries of config/mistakes/ free one such number each. They are refitted and weighed like the
+hypotheses of the search. A refit starts at the best decade: a storage that is far too small acts like
+none, so the factor has no slope at 1. A reading whose first sample contradicts the plant's start may be off
+by a constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, Posterior, fitted
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.plant.cores import LEAST, each
+from thermoctl.plant.language import Plant
+from thermoctl.plant.residuals import Problem
+from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.shipped import shipped
+
+MISTAKES = shipped("config/mistakes")
+WIDE = 10.0  # range of a constant, in differences between the first sample and the plant's start
+DECADES = tuple(10.0**k for k in range(-6, 7))  # a slip of a digit up to one of two prefixes
+
+
+def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
+    """Return the refits with one factor each that is significant; of more than `most` places the best ones.
+
+    `null`: the refit of the plant without any effect."""
+    entries = catalogue((MISTAKES,))
+    starts: dict[Key, list[tuple[float, Plant, Placed]]] = {}
+    for plant in (case.plant, null.rough_plant):
+        drives = case.drives(compile_plant(plant))
+        rig = Structure(plant, drives, [t.columns for t in case.tables])
+        for c in candidates(rig, entries):
+            if c.effect.where != "sensor" or c.place.output in case.off:
+                starts.setdefault(c.key, []).append(_start(case, c))
+    best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
+
+    def refitted(start: tuple[float, Plant, Placed]) -> Fitted | None:
+        """Return the refit from a start; None where it fails or the search was stopped."""
+        _, plant, placed = start
+        try:
+            return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null)
+        except (SimulationError, np.linalg.LinAlgError):
+            return None
+
+    tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
+    found = each(refitted, tried, LEAST * len(tried))
+    return [f for f in found if f is not None and not f.absent]
+
+
+def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
+    """Return (least cost, the plant with the number at the best of some values, the number)."""
+    (p,) = c.effect.parameters
+    off = case.off.get(c.place.output or "")
+    tried = DECADES if off is None else (off,)
+    span = {p.name: (p.low, p.high) if off is None else (-WIDE * abs(off), WIDE * abs(off))}
+    own = c.own(p.name)
+    placed = Placed(c, {p.name: own})
+    problem = Posterior(case, c.extend({}, span), (placed,)).problem
+    costs = [_cost(problem, {own: value}) for value in tried]
+    k = int(np.argmin(costs))
+    return costs[k], c.extend({p.name: tried[k]}, span), placed
+
+
+def _cost(problem: Problem, values: Mapping[str, float]) -> float:
+    try:
+        return problem.evaluate(problem.start(values), False).cost
+    except SimulationError:
+        return float("inf")

@@ -1,0 +1,204 @@
+"""Score test of every effect at every place: how much of the residual it could explain, without a refit.
+
+    r: whitened residual of the refit, the starts moved back to their priors' means
+    d: first-order change of the outputs by an effect, whitened
+    r', d': the same without what the plant's unknowns absorb (metric.py)
+    gain = (d'^T r')^2 / (d'^T d')
+
+The gain is chi-square with one degree of freedom (k for k amplitudes) where nothing is missing.
+d comes from the effect laid over the plant. Its change of dx/dt along the fitted trajectory drives the
+linearised plant (`Model.respond`). Its change of the outputs adds directly. New nodes are integrated
+alone along that trajectory. Rows are sums over blocks of samples: white noise stays white, and thousands
+of directions fit in memory.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from thermoctl.diagnosis.evidence.onsets import ONSETS
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, score
+from thermoctl.diagnosis.search.metric import Metric, Pushed
+from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
+from thermoctl.diagnosis.search.shapes import shape_grid
+from thermoctl.plant.cores import ABREAST, LEAST, each
+
+EPSILON = 1e-4  # amplitude at which a direction is taken
+CHUNK = 96
+EXACT = 4_000  # columns, up to which all are simulated
+
+
+Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+
+
+def directions(
+    metric: Metric, at: Sequence[Trajectory], columns: Iterable[Column]
+) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
+    """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
+    left = iter(columns)
+    while parts := [p for _ in range(ABREAST) if (p := list(itertools.islice(left, CHUNK)))]:
+        rows = each(lambda p: metric.responses(partial(_pushed, p, at), len(p)), parts, LEAST * len(parts))
+        yield from zip(parts, rows, strict=True)
+
+
+def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:
+    """Return the first-order changes by columns in recording r."""
+    forces: list[tuple[int, int]] = []
+    values: list[np.ndarray] = []
+    changed: dict[tuple[int, int], np.ndarray] = {}
+    for c, column in enumerate(part):
+        pushed, read = column.changes(at[r])
+        forces += [(state, c) for state in pushed]
+        values += pushed.values()
+        changed |= {(j, c): delta for j, delta in read.items()}
+    return Pushed(forces, np.stack(values, axis=1) if values else np.zeros((0, 0)), changed)
+
+
+@dataclass(frozen=True)
+class Norms:
+    """A column that was simulated, the norm of its whitened rows, and that of their projection."""
+
+    column: Column
+    whole: float
+    left: float
+
+
+Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
+
+
+def screen(
+    metrics: Sequence[Metric],
+    rig: Rig,
+    found: Sequence[Candidate],
+    edges: np.ndarray | None = None,
+    select: Select = lambda metrics, at, groups: groups,
+    norms: list[Norms] | None = None,
+) -> list[list[Direction]]:
+    """Return every candidate's best direction, best first, in each of the metrics.
+
+    The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
+    Of more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). `norms` receives
+    those of the first metric, if all columns are simulated."""
+    first = metrics[0]
+    at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
+    groups = [g for c in found for g in groups_of(c, first, edges)]
+    if sum(len(g.sizes) for g in groups) > EXACT:
+        groups, norms = select(metrics, at, groups), None
+    best: list[dict[int, Direction]] = [{} for _ in metrics]
+    pending: dict[tuple[Any, ...], list[Entry]] = {}
+    columns = (column for g in groups for column in g.columns())
+    for part, plain in directions(first, at, columns):
+        for metric, leaders in zip(metrics, best, strict=True):
+            rows = plain * metric.weight[:, None]
+            full = np.linalg.norm(rows, axis=0)
+            rows = metric.project(rows)
+            if metric is first and norms is not None:
+                left = np.linalg.norm(rows, axis=0)
+                norms += [Norms(*n) for n in zip(part, map(float, full), map(float, left), strict=True)]
+            for k, column in enumerate(part):
+                candidate, group, _, count = column.item
+                key = (id(metric), id(candidate), group)
+                entries = pending.setdefault(key, [])
+                entries.append((column, rows[:, k].copy(), float(full[k])))
+                if len(entries) == count:
+                    del pending[key]
+                    _score_rows(entries, metric, leaders)
+    return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
+
+
+def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
+    """Return the direction with its onset (or start and end) refined to the sample.
+
+    A refit cannot move them: a jump has no slope to follow. Each step's grid is four times as fine."""
+    kinds = found.candidate.effect.shapes.values()
+    if "onsets" not in kinds and "windows" not in kinds:
+        return found
+    duration = max(float(d.t[-1]) for d in metric.drives)
+    step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
+    while step > 0.5 * sample:
+        near = np.concatenate(
+            [
+                found.shape[k] + step * np.arange(-4, 5) / 4
+                for k in ("onset", "start", "end")
+                if found.shape.get(k, np.inf) <= duration
+            ]
+        )
+        (better,) = screen([metric], rig, [found.candidate], np.unique(near[(near >= 0) & (near < duration)]))
+        if better and better[0].gain > found.gain:
+            found = better[0]
+        step /= 4
+    return found
+
+
+@dataclass(frozen=True)
+class Group:
+    """The columns of an effect at a place that are scored together: amplitudes at one shape, or onsets.
+
+    `sizes`: shape and direction in the amplitudes of each column. `overlay` of the candidate, made once."""
+
+    candidate: Candidate
+    number: Any
+    sizes: tuple[tuple[dict[str, float], tuple[float, ...]], ...]
+    overlay: Callable[[], Overlay]
+
+    def columns(self) -> Iterator[Column]:
+        """Yield the columns."""
+        c = self.candidate
+        scale = 1 / EPSILON if any(p.amplitude for p in c.effect.parameters) else 1.0
+        for shape, dim in self.sizes:
+            own = {c.own(k): v for k, v in _values(c, shape, dim).items()}
+            yield Column((c, self.number, (shape, dim), len(self.sizes)), self.overlay, own, scale)
+
+
+def _values(c: Candidate, shape: Mapping[str, float], dim: Sequence[float]) -> dict[str, float]:
+    return parameter_values(c, shape, [EPSILON * v for v in dim])
+
+
+def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> list[Group]:
+    """Return the groups of columns that one candidate needs. `edges`: onsets to try instead of the grid."""
+    effect = c.effect
+    grids = {
+        key: shape_grid(kind, c, metric.runs)
+        if edges is None or kind != "onsets"
+        else [{"onset": float(v)} for v in edges]
+        for key, kind in effect.shapes.items()
+        if kind not in ("phases", "windows")
+    }
+    windowed = "windows" in effect.shapes.values()
+    if windowed:
+        duration = max(float(d.t[-1]) for d in metric.drives)
+        grids["window"] = [
+            {"start": float(v), "end": 10 * duration}
+            for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)
+        ]
+    phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
+    shapes = [
+        {k: v for part in combination for k, v in part.items()}
+        for combination in itertools.product(*grids.values())
+    ] or [{}]
+    dims = effect.dims if any(p.amplitude for p in effect.parameters) else ((1.0,),)
+    sizes = [tuple(({**shape, **phase}, dim) for dim in dims for phase in phases) for shape in shapes]
+    if windowed:
+        sizes = [tuple(s for part in sizes for s in part)]
+
+    @cache
+    def overlay() -> Overlay:  # of every group: only the values differ
+        """Return the candidate laid over the plant."""
+        return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
+
+    return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]
+
+
+def _score_rows(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
+    """Score the columns of one group, and keep their best direction."""
+    rows = np.stack([e[1] for e in entries], axis=1)
+    full = np.array([e[2] for e in entries])
+    score([e[0] for e in entries], rows, rows.T @ metric.residual, full, best)

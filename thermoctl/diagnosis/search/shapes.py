@@ -1,0 +1,138 @@
+"""The values of an entry's shapes (onsets, periods, thresholds ...) that a screening looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.simulate import Simulation
+
+REPEATED = 2.0  # periods over the span: fewer do not repeat
+BEYOND = 1 / 3, 2 / 3  # shares of the way from the last quantile to the extreme
+SLOW_TURNS, FINE_TURNS = 60.0, 4000  # each is looked at up to the first, the strongest up to the second
+
+
+def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
+    """Return the strongest numbers of turns over the signal x beyond SLOW_TURNS.
+
+    They are peaks of the spectrum over x of `errors` ((N,) by recording) without their slow part in time."""
+    fast = []
+    for e in errors:
+        e = np.nan_to_num(e)
+        total = np.concatenate([[0.0], np.cumsum(e)])
+        half = max(len(e) // 200, 4)
+        low, high = np.maximum(np.arange(len(e)) - half, 0), np.minimum(np.arange(len(e)) + half + 1, len(e))
+        fast.append(e - (total[high] - total[low]) / (high - low))
+    e = np.concatenate(fast)
+    e = np.clip(e, *(np.array([-8, 8]) * (1.4826 * float(np.median(np.abs(e))) or np.inf)))
+    good = np.isfinite(x)
+    if not good.any():
+        return np.zeros(0)
+    bins = 8 * FINE_TURNS
+    index = np.clip(((x[good] - np.min(x[good])) / span * bins).astype(int), 0, bins - 1)
+    power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[
+        : 4 * FINE_TURNS
+    ]  # by a quarter of a turn
+    power[: int(4 * SLOW_TURNS)] = 0.0
+    peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    return peaks[np.argsort(-power[peaks])[:count]] / 4
+
+
+Grid = list[dict[str, float]]
+
+
+def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> Grid:
+    """Return the values of a shape to look at in screening.
+
+    `picked_from`: of how many values the residual itself picked this one. `longest`: a longer period does not
+    repeat in the recordings."""
+    if kind in ("onsets", "windows", "times", "lags", "delays"):
+        return _times(kind, candidate.rig.duration, candidate.rig.sample, onsets)
+    if kind in ("periods", "phases", "distances"):
+        return _positions(kind, candidate, runs)
+    if kind in ("speeds", "creep_speeds"):
+        v = np.abs(_signal(candidate, runs, _symbols(candidate)["v"]))
+        top = float(np.nanmax(v)) or 1.0
+        if kind == "creep_speeds":  # the speed below which dry friction gives way smoothly
+            return [{"creep": 1e-3 * top}]
+        return [{"speed": float(q)} for q in np.geomspace(0.01 * top, 0.6 * top, 8)]
+    return _levels(kind, candidate, runs)
+
+
+def _symbols(candidate: Candidate) -> dict[str, Expr]:
+    return {**candidate.place.symbols, **candidate.symbols}
+
+
+def _signal(candidate: Candidate, runs: Sequence[Simulation], e: Expr) -> np.ndarray:
+    """Return the values of an expression over all recordings, one after the other."""
+    rig, parts = candidate.rig, []
+    for d, run, columns in zip(rig.drives, runs, rig.columns, strict=True):
+        values = {
+            **{c: columns[c] for c in rig.spare},
+            **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
+            **dict(zip(rig.plant.nodes, run.x.T, strict=True)),
+            "t": d.t,
+            **{q: p.value for q, p in rig.plant.parameters.items()},
+        }
+        parts.append(np.broadcast_to(np.asarray(ex.evaluate(e, values), float), d.t.shape))
+    return np.concatenate(parts)
+
+
+def _times(kind: str, duration: float, dt: float, onsets: int) -> Grid:
+    """Return moments of recordings of `duration` s, or times between their sampling time `dt` and it."""
+    if kind == "onsets":
+        return [{"onset": float(v)} for v in np.linspace(0, duration, onsets + 2)[1:-1]]
+    if kind == "windows":
+        edges = np.linspace(0, duration, onsets + 1)
+        return [
+            {"start": float(a), "end": float(b)} for k, a in enumerate(edges[:-1]) for b in edges[k + 1 :]
+        ]
+    least, most, count = {"times": (3, 0.6, 12), "lags": (0.5, 0.1, 10), "delays": (0.3, 0.03, 9)}[kind]
+    return [{"tau": float(v)} for v in np.geomspace(least * dt, most * duration, count)]
+
+
+def _positions(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
+    """Return periods, phases or distances over the signal x, or for a distance over the position."""
+    rig, symbols = candidate.rig, _symbols(candidate)
+    x = _signal(candidate, runs, symbols["x"]) if "x" in symbols else np.array([0.0, 1.0])
+    if kind == "distances" and "x" not in symbols:
+        position = rig.position_of.get(candidate.place.nodes.get("v") or "")
+        x = _signal(candidate, runs, name(position)) if position else x
+    span = float(np.ptp(x[np.isfinite(x)])) or 1.0
+    if kind == "phases":
+        return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
+    if kind == "distances":
+        return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]
+    longest = span / REPEATED
+    # neighbouring periods differ by a quarter of a turn over the span
+    slow = [{"period": float(span / n), "longest": longest} for n in np.arange(REPEATED, SLOW_TURNS, 0.25)]
+    if not candidate.place.output:
+        return slow
+    j = list(rig.plant.outputs).index(candidate.place.output)
+    errors = [d.y[:, j] - run.y[:, j] for d, run in zip(rig.drives, runs, strict=True)]
+    fine = {"longest": longest, "picked_from": 4.0 * FINE_TURNS}
+    return slow + [{"period": float(span / n), **fine} for n in _fine_turns(x, errors, span)]
+
+
+def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
+    """Return levels of what is read, driven or flows."""
+    symbols = _symbols(candidate)
+    target = symbols.get("y") or symbols.get("u") or symbols.get("a")
+    z = _signal(candidate, runs, target) if target is not None else np.array([0.0, 1.0])
+    z = z[np.isfinite(z)]
+    if kind == "small_levels":
+        top = float(np.max(np.abs(z))) or 1.0
+        return [{"level": float(v)} for v in np.geomspace(0.001 * top, 0.6 * top, 14)]
+    quantiles = [0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.99]
+    if kind == "drive_levels":
+        z, quantiles = np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]
+    if kind == "end_levels" and candidate.variant == 1:
+        quantiles = [1 - q for q in quantiles]
+    end = float(np.quantile(z, round(quantiles[-1])))
+    levels = np.quantile(z, quantiles)
+    beyond = levels[-1] + np.array(BEYOND) * (end - levels[-1])  # a start or a pulse may be all that is there
+    return [{"level": float(v)} for v in np.unique([*levels, *beyond])]

@@ -1,0 +1,129 @@
+"""The screened directions that are worth a refit, alone or in pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.evidence.fit import Placed
+from thermoctl.diagnosis.evidence.odds import odds
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.places import PLACES
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
+from thermoctl.diagnosis.search.metric import Metric
+from thermoctl.diagnosis.search.screening import Screened
+from thermoctl.plant import expression as ex
+
+PAIR = 2
+EVENTS = ("onsets", "windows")  # shapes that happen at one moment
+HALF = 2.0  # times its first-order promise that a refit may gain
+ALIKE = 0.999  # cosine of two directions, above which they are one
+
+
+def relabels(c: Candidate) -> bool:
+    """Return whether the plant or a simpler entry at the same place already contains this physics."""
+    if c.effect.where == "bending_pair":
+        return any(_free_member(c, side) for side in ("TA", "TB"))
+    displaced = PLACES["displacement"](c.rig)
+    return (
+        c.effect.where != "displacement"
+        and "tau" in c.effect.shapes
+        and any(p.output == c.place.output for p in displaced)
+    )
+
+
+def _free_member(c: Candidate, side: str) -> bool:
+    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
+    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    slope = ex.derivative(now, str(c.place.symbols[side].value))
+    parameters = c.rig.plant.parameters
+    return any(n in parameters and parameters[n].range for n in ex.names(slope))
+
+
+def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
+    """Return the simpler entries at the same places, to try without an insignificant part."""
+
+    def is_simpler(d: Direction, a: Direction) -> bool:
+        """Return whether d is the simpler effect at the place of a."""
+        new, old = d.candidate.effect, a.candidate.effect
+        fewer = len(new.parameters) < len(old.parameters)
+        return d.candidate.place.where == a.candidate.place.where and (fewer or new.name == old.contains)
+
+    return [d for d in looked.directions if d.gain > 0 and any(is_simpler(d, a) for a in added)]
+
+
+def shortlist(
+    looked: Screened, where: Mapping[str, set[str]], limits: Limits
+) -> list[tuple[tuple[Direction, ...], float]]:
+    """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
+
+    The best is first. Those with the largest gain in energy follow. Either list has at most
+    PLACES_EACH places of one effect."""
+    paying = []
+    for d, promise in zip(looked.directions, looked.promises, strict=True):
+        gain = promise + odds((Placed(d.candidate, {}),), where, limits)
+        if gain > 0 and d.gain > 0 and not relabels(d.candidate):
+            paying.append((d, gain))
+    paying.sort(key=lambda x: -x[1])
+    gains = {d.candidate.key: gain for d, gain in reversed(paying)}
+    best = foremost(once(d for d, _ in paying), PLACES_EACH)[: limits.shortlist]
+    out = [((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > paying[0][1]]
+    known = {d.candidate.key for (d,), _ in out}
+    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
+    together = pairs([d for d, _ in paying], looked.metric, limits)
+    if looked.energy:
+        together += pairs(looked.by_energy, looked.energy, limits)
+    return [*out, *((p, np.inf) for p in together)]
+
+
+def largest(looked: Screened) -> list[Direction]:
+    """Return the foremost candidates whose gain in energy is at least half of the best one's."""
+    enough = [d for d in looked.by_energy if HALF * d.gain > looked.by_energy[0].gain]
+    best = foremost(once(d for d in enough if not relabels(d.candidate)), PLACES_EACH)
+    return [dataclasses.replace(d, vector=None) for d in best]
+
+
+def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
+    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
+
+    The plant's own parameters may imitate each alone, but not both together."""
+    kept = once(
+        d
+        for d in directions
+        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values())
+    )
+    if len(kept) < PAIR:
+        return []
+    v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
+    g = np.maximum(v @ metric.residual, np.finfo(float).tiny)
+    c = np.clip(v @ v.T, -ALIKE, ALIKE)
+    first = (g[:, None] - c * g[None]) / (
+        1 - c**2
+    )  # size of the first beside the second, along its unit vector
+    joint = g[:, None] * first + g[None] * first.T
+    alone = np.array([d.gain for d in kept])
+    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
+    out: list[tuple[Direction, ...]] = []
+    for k in np.argsort(-extra, axis=None):
+        a, b = np.unravel_index(k, extra.shape)
+        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
+            break
+        pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
+        if all(d is not None for d in pair):
+            out.append(tuple(d for d in pair if d is not None))
+    return out
+
+
+def resized(d: Direction, factor: float) -> Direction | None:
+    """Return the direction with its size multiplied by `factor`; None if the size leaves its bounds."""
+    start = dict(d.start)
+    for p in d.candidate.effect.parameters:
+        if p.amplitude:
+            start[p.name] = p.null + factor * (start[p.name] - p.null)
+            low, high = d.candidate.bounds(p)
+            if not low <= start[p.name] <= high:
+                return None
+    return dataclasses.replace(d, start=start)

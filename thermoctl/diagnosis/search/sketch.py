@@ -1,0 +1,151 @@
+"""The likeliest of many thousand directions, without a simulation of each.
+
+    gain = ((P d)' r)^2 / |P d|^2,    d = W B y(q)
+
+- y(q): first-order response of the outputs to an effect's forces q (screen.py)
+- B: samples to DCT rows; W: the weights that whiten them; r: residual
+- P: takes off the part that the plant's own unknowns absorb
+
+The product of d with a row vector w is an inner product with the forces:
+
+    w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w
+
+l is a run of the adjoint plant, backwards, for each w. One run gives the numerators of all directions.
+SKETCHES more give the norms: with random signs s_k, the mean of ((P' s_k)' d)^2 is |P d|^2. Its relative
+standard deviation is sqrt(2 / SKETCHES). Links between all pairs of N bodies then cost products, and no
+simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import csc_matrix, identity
+from scipy.sparse.linalg import splu
+
+from thermoctl.diagnosis.search.gains import Column, Direction, score
+from thermoctl.diagnosis.search.metric import Metric
+from thermoctl.diagnosis.search.overlay import Trajectory
+from thermoctl.diagnosis.search.screen import Group
+from thermoctl.plant import expression as ex
+
+# None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
+SKETCHES = 32  # a gain is known within 25 %
+KEPT = 1_500  # columns that are simulated, for each metric
+SAMPLES = 4_000  # of an adjoint run, at most; forces are summed from one to the next
+GAMMA = 1 - float(np.sqrt(0.5))  # of the method that integrates: two stages, second order, L-stable
+
+
+def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[Group]) -> list[Group]:
+    """Return the best group of each of the likeliest candidates, up to KEPT columns for each metric.
+
+    All groups where the plant has no adjoint in this form: with a delay or an FMU."""
+    code = metrics[0].model.code
+    if code.input_delays or code.output_delays or code.fmus:
+        return groups
+    columns = [column for g in groups for column in g.columns()]
+    edges = np.cumsum([len(g.sizes) for g in groups])[:-1]
+    keep: set[int] = set()
+    for found in products(metrics, at, columns):
+        parts = np.split(found, edges)
+        keep |= _best(groups, [_scored(list(g.columns()), x) for g, x in zip(groups, parts, strict=True)])
+    return [groups[i] for i in sorted(keep)]
+
+
+def products(
+    metrics: Sequence[Metric], at: Sequence[Trajectory], columns: Sequence[Column]
+) -> list[np.ndarray]:
+    """Return by metric the products (columns, 1 + SKETCHES) with the residual and the sketches."""
+    vectors = [_vectors(metric) for metric in metrics]
+    out = np.zeros((len(columns), len(metrics) * (1 + SKETCHES)))
+    for r, trajectory in enumerate(at):
+        pull = np.concatenate([m.spread(r, v) for m, v in zip(metrics, vectors, strict=True)], axis=2)
+        forces, starts = _adjoint(metrics[0], trajectory, pull)
+        for k, column in enumerate(columns):
+            pushed, read = column.changes(trajectory)
+            for state, q in pushed.items():
+                out[k] += np.add.reduceat(q, starts) @ forces[state]
+            for j, delta in read.items():
+                out[k] += delta @ pull[:, j]
+    return np.split(out, len(metrics), axis=1)
+
+
+def _vectors(metric: Metric) -> np.ndarray:
+    """Return the residual and the sketches (rows, 1 + SKETCHES), with the weights that whiten a row."""
+    signs = np.random.default_rng(23).choice([-1.0, 1.0], (len(metric.weight), SKETCHES))
+    whole = np.concatenate([metric.residual[:, None], signs / np.sqrt(SKETCHES)], axis=1)
+    return metric.pulled(whole) * metric.weight[:, None]
+
+
+def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None:
+    """Return the direction of a group from its columns' products (k, 1 + SKETCHES)."""
+    rows, best = products[:, 1:].T, dict[int, Direction]()
+    score(columns, rows, products[:, 0], np.linalg.norm(rows, axis=0), best)
+    return next((d for d in best.values() if d.gain > 0), None)
+
+
+def _best(groups: Sequence[Group], found: Sequence[Direction | None]) -> set[int]:
+    """Return the positions of the best group of each of the best candidates, up to KEPT columns."""
+    best: dict[int, tuple[float, int]] = {}
+    for i, (g, d) in enumerate(zip(groups, found, strict=True)):
+        if d is not None:
+            best[id(g.candidate)] = min(best.get(id(g.candidate), (np.inf, i)), (d.log_p, i))
+    order = [i for _, i in sorted(best.values())]
+    until = np.searchsorted(np.cumsum([len(groups[i].sizes) for i in order]), KEPT, side="right")
+    return set(order[:until])
+
+
+def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return l (states, samples, k) for `pull` (N, outputs, k), and the first row of each sample.
+
+    l is averaged over the rows of a sample. The method is the transpose of two implicit stages over each
+    interval h, with the forces on straight lines between rows:
+
+        M k1 = J x + q(GAMMA),   M k2 = J (x + (1 - GAMMA) h k1) + q(1),   M = 1 - GAMMA h J
+        x' = x + h ((1 - GAMMA) k1 + GAMMA k2)"""
+    model, t = metric.model, at.drive.t
+    nx, n, k = len(model.states), len(t), pull.shape[2]
+    starts = np.arange(0, n, -(-n // SAMPLES))
+    sample = np.searchsorted(starts, np.arange(n), side="right") - 1
+    slopes = _Entries(at, model.code.jacobian())
+    seen = _Entries(
+        at,
+        [
+            (j, i, d)
+            for j, o in enumerate(model.plant.outputs.values())
+            for i, s in enumerate(model.states)
+            if (d := ex.derivative(o.value, s)) is not ex.ZERO
+        ],
+    )
+    out = np.zeros((nx, len(starts), k), np.float32)
+    x, known = np.zeros((nx, k)), None
+    for m in range(n - 1, -1, -1):
+        own = np.zeros((nx, k))
+        if m < n - 1:
+            h = float(t[m + 1] - t[m])
+            middle = 0.5 * (slopes.values[:, m] + slopes.values[:, m + 1])
+            if known is None or h != known[0] or not np.array_equal(middle, known[1]):
+                known = h, middle, splu(slopes.without(GAMMA * h * middle, nx))
+            solve = known[2].solve
+            k2 = solve(GAMMA * h * x, "T")
+            pulled = k2 / (GAMMA * h) - x  # J' k2
+            right = (1 - GAMMA) * h * (x + pulled)
+            k1 = solve(right, "T")
+            x = x + pulled + (k1 - right) / (GAMMA * h)
+            out[:, sample[m + 1]] += k2 + GAMMA * k1
+            own = (1 - GAMMA) * k1
+        np.add.at(x, seen.place[1], seen.values[:, m, None] * pull[m, seen.place[0]])
+        out[:, sample[m]] += own
+    return out / np.bincount(sample)[:, None].astype(np.float32), starts
+
+
+class _Entries:
+    """Entries (row, column, expression) of a matrix, and their values (entries, N) along a trajectory."""
+
+    def __init__(self, at: Trajectory, entries: Sequence[tuple[int, int, ex.Expr]]):
+        self.place = [i for i, *_ in entries], [j for _, j, _ in entries]
+        self.values = np.array([at.value(e, {}) for *_, e in entries]).reshape(len(entries), len(at.drive.t))
+
+    def without(self, values: np.ndarray, size: int) -> csc_matrix:
+        """Return the identity less the matrix of these values."""
+        return identity(size, format="csc") - csc_matrix((values, self.place), (size, size))

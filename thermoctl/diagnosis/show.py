@@ -1,0 +1,82 @@
+"""The commands `effects` and `diagnose --explain`: they only read, so they load neither models nor fits."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.report.explain import explain, why
+from thermoctl.yamlfile import InputError, suggest
+
+
+def explained(folder: str, effect: str | None = None) -> int:
+    """Print the reasons of a diagnosis, or those of one effect. Raises InputError where there is none."""
+    found = read(Path(folder))
+    print(why(found, effect) if effect else explain(found))
+    return 0
+
+
+def effects(args: argparse.Namespace) -> int:
+    """`thermoctl effects [show NAME]`: list the catalogue, or show an entry. Raises InputError."""
+    found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
+    console = Console(soft_wrap=True)
+    if args.action == "show":
+        if args.name not in found:
+            raise InputError(
+                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
+                "`thermoctl effects` lists them"
+            )
+        e = found[args.name]
+        console.print(
+            f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
+            f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
+        )
+        for number, change in enumerate(e.changes):
+            for item in change:
+                for kind, value in item.items():
+                    body = (
+                        ", ".join(f"{k}: {v}" for k, v in value.items())
+                        if isinstance(value, dict)
+                        else str(value)
+                    )
+                    console.print(
+                        f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False
+                    )
+        for p in e.parameters:
+            console.print(
+                f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}",
+                markup=False,
+            )
+        return 0
+    if args.action:
+        raise InputError(
+            f"effects: 'show NAME', 'check FILE', 'save DIR NAME' or nothing was expected, not '{args.action}'"
+        )
+    table = Table("effect", "place", "what it is", box=None, header_style="bold")
+    for e in found.values():
+        table.add_row(e.name, e.where, e.title)
+    console.print(table)
+    return 0
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """Read the result of an earlier diagnosis. Raises InputError."""
+    path = folder / "diagnosis.json"
+    try:
+        found = json.loads(path.read_text())
+    except OSError:
+        raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
+    except ValueError as e:
+        raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
+    if (
+        not isinstance(found, dict)
+        or not {"decision", "hypotheses", "lost", "refused", "promised"} <= found.keys()
+    ):
+        raise InputError(f"{path}: written by an older version, without its reasons; diagnose again")
+    return found

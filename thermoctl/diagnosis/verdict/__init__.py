@@ -1,0 +1,1 @@
+"""The decision: physics or misfit, confirmed or not, and the verdict."""

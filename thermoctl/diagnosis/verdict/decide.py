@@ -1,0 +1,136 @@
+"""Verdict from posterior, remainder and held-out error: a pure function.
+
+The first row of a table whose condition holds decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.limits import Limits
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probability of each hypothesis tried (by its effects), and of each effect.
+
+    `something`: that some effect or law is there"""
+
+    hypotheses: Mapping[frozenset[Key], float]
+    effects: Mapping[Key, float]
+    something: float
+
+
+@dataclass(frozen=True)
+class Facts:
+    """All numbers that a verdict depends on.
+
+    - `something`: probability that some effect or law is there; `known`: the same, 0 if nothing confirms one
+    - `named`: effects whose own probability is high enough
+    - `over_noise`: the largest ratio of a residual to its sensor's noise
+    - `remains`: the largest probability of a remainder at an output
+    - `flow`: probability that a flow is missing which no output shows alone
+    - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
+
+    something: float
+    known: float
+    named: tuple[Key, ...]
+    over_noise: float
+    worth: float
+    remains: float = 0.0
+    worse: float = 0.0
+    flow: float = 0.0
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The verdict, the named effects, the alternatives, and the row that decided, with its numbers."""
+
+    verdict: str
+    named: tuple[Key, ...]
+    alternatives: tuple[tuple[Key, float], ...]
+    row: str
+    numbers: Mapping[str, float]
+
+
+def weigh(
+    scores: Mapping[frozenset[Key], float],
+    physics: Mapping[frozenset[Key], Mapping[Key, float]],
+    limits: Limits,
+) -> Posterior:
+    """Return the posterior of hypotheses, the likeliest first, and of each effect.
+
+    `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
+    a value above 1 makes the probabilities less extreme. `physics`: probability that each effect of a
+    hypothesis is physics and no unnamed misfit."""
+    total = logsumexp(np.array([*scores.values()]) / limits.temperature)
+    of = {keys: float(np.exp(score / limits.temperature - total)) for keys, score in scores.items()}
+    order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
+    hypotheses = {keys: of[keys] for keys in order}
+    effects: dict[Key, float] = {}
+    something = 0.0
+    for keys, q in hypotheses.items():
+        something += q * max(physics[keys].values(), default=0.0)
+        for key in keys:
+            effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
+    return Posterior(hypotheses, effects, something)
+
+
+def _only_noise(f: Facts, limits: Limits) -> bool:
+    """Is the residual about as large as the noise, and neither a remainder nor an unknown flow certain?"""
+    return f.over_noise <= limits.clean and max(f.remains, f.flow) < limits.name
+
+
+ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
+    (
+        "nothing is supported for sure and the residual is the sensors' noise",
+        lambda f, q: f.something < q.name and _only_noise(f, q),
+        "consistent",
+    ),
+    ("nothing is supported for sure and a remainder stays", lambda f, q: f.something < q.name, "unexplained"),
+    (
+        "something is missing, and nothing else confirms an effect or law",
+        lambda f, q: f.known < q.name,
+        "unexplained",
+    ),
+    (
+        "the findings predict held-out data worse than a refit alone",
+        lambda f, q: f.worse >= q.name,
+        "unexplained",
+    ),
+    ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
+    ("findings are supported and the residual is the sensors' noise", _only_noise, "explained"),
+    ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
+)
+
+
+def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
+    """The first row that holds."""
+    row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
+    numbers = {
+        "something": facts.something,
+        "known": facts.known,
+        "over_noise": facts.over_noise,
+        "worth": facts.worth,
+        "worse": facts.worse,
+        "remains": facts.remains,
+        "flow": facts.flow,
+        **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
+    }
+    named = facts.named if verdict in ("explained", "partly_explained") else ()
+    return Decision(verdict, named, alternatives(posterior, named, limits), row, numbers)
+
+
+def alternatives(posterior: Posterior, named: Sequence[Key], limits: Limits) -> tuple[tuple[Key, float], ...]:
+    """Return the other effects of the likeliest hypotheses that together reach probability `limits.set`."""
+    total, found = 0.0, set[Key]()
+    for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):
+        if total >= limits.set:
+            break
+        total += p
+        found |= keys
+    return tuple(sorted(((k, posterior.effects[k]) for k in found - set(named)), key=lambda x: (-x[1], x[0])))

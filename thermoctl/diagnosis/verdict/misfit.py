@@ -1,0 +1,159 @@
+"""Is an effect physics, or the shape of a misfit that nobody will name?
+
+Every plant is also wrong in small ways, whose misfits have the shapes of effects. Their energy is what a
+hypothesis leaves. Along the direction of one effect such a misfit is normal: along each parameter of the
+effect lies the share `alike` of its energy. Readings share the causes of their misfits, so these are taken
+together. A reading o without a misfit tells the effect's size up to the noise of its n_o rows. The size of a
+true effect is log-uniform. With r, the effect's size in standard deviations of all readings together,
+
+    r^2 = (energy that the effect removes) / (share (energy that stays))  of readings with a misfit
+          + sum_o n_o (energy that it removes)                            of readings without one
+    share = 1 - (1 - alike)^parameters,   odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
+
+Energies are mean squares of an output's residuals over its sensor's noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted
+from thermoctl.diagnosis.evidence.levels import rounded, timing
+from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.search.beam import Searched
+
+MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
+SURE = 200.0  # r^2 beyond which the probability is 1 in any case
+
+
+@dataclasses.dataclass(frozen=True)
+class Energy:
+    """Of each output: mean square of residuals over the noise, the part beyond the noise, number of rows."""
+
+    squares: tuple[float, ...]
+    misfit: tuple[float, ...]
+    rows: tuple[float, ...]
+
+    @property
+    def all(self) -> float:
+        """Sum over outputs."""
+        return sum(self.squares)
+
+
+def standing(
+    energy: Mapping[frozenset[Key], Energy],
+    dims: Mapping[Key, int],
+    contains: Mapping[str, str],
+    limits: Limits,
+) -> dict[frozenset[Key], dict[Key, float]]:
+    """Return the hypotheses of which an effect stands out of the misfit: the probability of each.
+
+    An effect has to stand out against the best tried hypothesis that holds part of the others. Effects that
+    do not are part of the misfit. The others then have to stand out beside them or without them. An effect
+    that does not stand out against the simpler one that it contains is that one: no hypothesis holds it.
+    `dims`: number of parameters of each effect; `contains`: the simpler effect of some."""
+    found: dict[frozenset[Key], dict[Key, float]] = {}
+    simpler = set()
+    for home in sorted(energy, key=len):
+        mine, own = energy[home], {}
+        for key in home:
+            part = (e for keys, e in energy.items() if keys < home and key not in keys)
+            without = min(part, key=lambda e: e.all)
+            own[key] = physics(without, mine, 1 - (1 - limits.alike) ** dims[key])
+        stand = standouts(own)
+        if stand in simpler or any(_is_simpler(home, key, energy, dims, contains, limits) for key in home):
+            simpler.add(home)
+            continue
+        for key, p in found.get(stand, {}).items() if stand < home else ():
+            own[key] = max(own[key], p)
+        found[home] = own
+    return {home: own for home, own in found.items() if not home or standouts(own)}
+
+
+def _is_simpler(
+    home: frozenset[Key],
+    key: Key,
+    energy: Mapping[frozenset[Key], Energy],
+    dims: Mapping[Key, int],
+    contains: Mapping[str, str],
+    limits: Limits,
+) -> bool:
+    """Return whether an effect of a hypothesis is the simpler one that it contains, and a misfit."""
+    effect, where = key
+    simple = (contains.get(effect, ""), where)
+    other = energy.get(home - {key} | {simple})
+    if other is None or simple in home:
+        return False
+    more = max(dims[key] - dims[simple], 1)
+    return physics(other, energy[home], 1 - (1 - limits.alike) ** more) <= MISFIT
+
+
+def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
+    """Return the effects that are rather physics than a misfit."""
+    return frozenset(key for key, p in of.items() if p > MISFIT)
+
+
+def supported(
+    likeliest: frozenset[Key], found: Mapping[frozenset[Key], Mapping[Key, float]]
+) -> frozenset[Key]:
+    """Return the effects of a hypothesis without those that are rather a misfit.
+
+    The weakest is left out first. Of two that explain the same, neither stands out beside the other, and the
+    stronger one does without it. `found`: as of `standing`."""
+    keys = likeliest
+    while own := found.get(keys, {}):
+        weakest = min(own, key=lambda key: own[key])
+        if own[weakest] > MISFIT:
+            return keys
+        keys = keys - {weakest}
+    return standouts(found[likeliest])
+
+
+def physics(without: Energy, beside: Energy, share: float) -> float:
+    """Return the probability that an effect is physics, from the energies without it and beside it."""
+    if not any(beside.misfit):
+        return 1.0
+    removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
+    known = max(float(removed[left > 0].sum()), 0.0) / (share * float(left.sum()))
+    known += float(removed[left == 0] @ np.array(beside.rows)[left == 0])
+    square = float(np.clip(known, 0.0, SURE))
+    r = max(np.sqrt(square), 1.0)
+    odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
+    return float(odds / (1 + odds))
+
+
+def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozenset[Key], Energy]:
+    """Return the energies of all hypotheses.
+
+    Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
+    The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
+    Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it.
+    Of the two refits of a hypothesis the better one counts."""
+    leader = searched.tried[0].fitted
+    own = np.add(leader.average.sensor, timing(case, leader))
+    noise = list(zip(own, rounded(case), strict=True))
+    out = {}
+    for w in searched.tried:
+        both = [_energy(case, f, noise, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
+        out[w.fitted.hypothesis.keys] = min(both, key=lambda e: e.all)
+    return out
+
+
+def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: Limits) -> Energy:
+    """Return the energies of a refit.
+
+    `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
+    found = []
+    for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
+        output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
+        power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
+        rows = float(g.count.sum()) + f.past.counts.get(output, 0.0)
+        square = power / (rows * own)
+        noisy = 1.0 if p >= limits.name and not coarse else limits.clean**2
+        found.append((square, max(square - noisy, 0.0), rows))
+    return Energy(*zip(*found, strict=True))

@@ -1,0 +1,137 @@
+"""Is a flow missing that no single reading shows?
+
+Each reading's noise may hide a slow error, but a flow into one node reaches several readings together. An
+unknown flow into a node, or along a flow from node to node, is a hypothesis like any other. It is straight
+lines between KNOTS knots of each recording. Their values w are independent and normal, with the share eta
+of the typical flow there as sd. X holds the responses to them, without the part that the plant's own
+parameters absorb. r is the residual. By Laplace's method, at the likeliest w,
+
+    log p(D | flow) = log p(r - X w) - 1/2 w'w - 1/2 log |1 + X' V^-1 X|.
+
+Noise and remainder are averaged as always. 1/V is their mean for r - X w, because part of the noise may be
+the flow. eta is log-uniform over SHARES. Readings that rest on the steps of their rounding err with the
+signal, so they do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import expit, logsumexp
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, as_weighed
+from thermoctl.diagnosis.evidence.levels import rounded
+from thermoctl.diagnosis.evidence.where import signals, typical_flow, typical_rate
+from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
+from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulate import SimulationError
+
+KNOTS, FEWEST, TOGETHER = 24, 6, 240  # of a recording; least number; about so many in all recordings
+ROUNDS, SETTLED = 4, 0.1  # of flow and noise in turn, until the evidence changes by fewer nats
+SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
+
+
+@dataclass(frozen=True)
+class Missing:
+    """The probability that something unknown is missing, the node where it most likely is, and a sentence."""
+
+    probability: float = 0.0
+    node: str | None = None
+    sentence: str = ""
+
+    def told(self, verdict: str, limits: Limits) -> str:
+        """Return the sentence, if it is certain, or beside effects that are not certain either."""
+        if self.probability >= limits.name:
+            return self.sentence
+        if verdict == "ambiguous" and self.probability > 1 - limits.set:
+            return f"or {self.sentence} (probability {self.probability:.2f})"
+        return ""
+
+
+def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> Missing:
+    """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
+
+    Its prior odds are those of a piece of physics, and of an unknown function of time."""
+    try:
+        gains = flow_gains(case, f, nodes)
+    except (SimulationError, np.linalg.LinAlgError):
+        return Missing()
+    if not gains:
+        return Missing()
+    odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
+    p = float(expit((logsumexp(list(gains.values())) + odds) / limits.temperature))
+    best = max(gains, key=lambda where: gains[where])
+    along = f.plant.flows.get(best)
+    where = f"along {best}" if along else f"into {best}"
+    sentence = (
+        f"a flow {where} is missing that no effect explains: readings that hide it one by one "
+        "show it together"
+    )
+    return Missing(p, along.source if along else best, sentence)
+
+
+def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
+    """Return the log Bayes factor of an unknown flow into each node and along each flow between two of them.
+
+    Raises SimulationError."""
+    f = as_weighed(f)
+    metric = Rows(Plain(case, f, ROWS), f.average, True)
+    runs = [
+        signals(metric.model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
+    ]
+    knots = int(np.clip(TOGETHER // len(runs), FEWEST, KNOTS))
+    hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
+    names = [case.coordinates.channels[g.channels[0]].output for g in case.grids]
+    coarse = {j for j, is_coarse in zip(names, rounded(case), strict=True) if is_coarse}
+    counts = np.concatenate(
+        [np.full(c.rows, c.output not in coarse) for c in metric.plain.coordinates.channels]
+    )
+    _, weight = metric.weighed(metric.residual)
+    responses = {n: block_diag(*flow_rows(metric, runs, n, hats, 1.0)) for n in nodes}
+    out = {}
+    for where, response, size in _ways(metric.model.plant, responses, runs):
+        x = metric.project(size * response) * counts[:, None]
+        scores = [evidence(metric, x * share, weight)[0] for share in SHARES]
+        gain = float(logsumexp(scores) - np.log(len(SHARES)))
+        if np.isfinite(gain):
+            out[where] = gain
+    return out
+
+
+def _ways(
+    plant: Plant, responses: Mapping[str, np.ndarray], runs: Sequence[Mapping[str, np.ndarray | float]]
+) -> Iterator[tuple[str, np.ndarray, float]]:
+    """Yield where a flow may be missing, its unit response and its typical size.
+
+    It comes from outside into a node, or it goes along a flow of the plant, from node to node."""
+    for n, response in responses.items():
+        size = typical_flow(plant, n, runs)
+        if size > 0:
+            yield n, response, size
+    for f in plant.flows.values():
+        if f.source and f.target and {f.source, f.target} <= responses.keys():
+            size = typical_rate(f, runs)
+            if size > 0:
+                yield f.name, responses[f.target] - responses[f.source], size
+
+
+def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method, and w.
+
+    `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
+    score, w = -np.inf, np.zeros(x.shape[1])
+    for _ in range(ROUNDS):
+        inside = x * weight[:, None]
+        curvature = np.eye(x.shape[1]) + inside.T @ inside
+        w = np.linalg.solve(curvature, inside.T @ (metric.residual * weight))
+        likelihood, weight = metric.weighed(metric.residual - x @ w)
+        before, score = score, likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
+        if abs(score - before) < SETTLED:
+            break
+    return score, w
