@@ -49,6 +49,10 @@ prove: develop                     # the full proof on concealed cases: made, se
 truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60
 	$(BIN)/python -m tests.truth --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(OLD),--old $(OLD))
 
+.PHONY: ablate
+ablate: truth                      # what each rule of the decision is worth: the cases of make truth without it; SEARCH=1: those of the search, hours
+	$(BIN)/python -m tests.truth.ablate --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(SEARCH),--search)
+
 CALIBRATION ?= build/calibration
 calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue
 	$(BIN)/python -m tests.concealed.generate --world open --answers inside --number 32 --seed 11102 --out $(CALIBRATION)/open_11102

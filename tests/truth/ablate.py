@@ -139,20 +139,28 @@ RULES: Mapping[str, Rule] = {
 }
 
 
+def part_of(path: str) -> Any:
+    """Return a name of the program, below thermoctl.diagnosis."""
+    module, attribute = path.rsplit(".", 1)
+    return getattr(importlib.import_module(f"thermoctl.diagnosis.{module}"), attribute)
+
+
 @contextmanager
 def left_out(rule: Rule) -> Iterator[None]:
     """Leave a rule out of the program of this process."""
-    held = []
-    for name, other in rule.without.items():
-        module, attribute = name.rsplit(".", 1)
-        of = importlib.import_module(f"thermoctl.diagnosis.{module}")
-        held.append((of, attribute, getattr(of, attribute)))
-        setattr(of, attribute, other)
+    held = {path: part_of(path) for path in rule.without}
     try:
+        for path, other in rule.without.items():
+            _put(path, other)
         yield
     finally:
-        for of, attribute, value in held:
-            setattr(of, attribute, value)
+        for path, value in held.items():
+            _put(path, value)
+
+
+def _put(path: str, value: Any) -> None:
+    module, attribute = path.rsplit(".", 1)
+    setattr(importlib.import_module(f"thermoctl.diagnosis.{module}"), attribute, value)
 
 
 def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, str | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
@@ -11,6 +12,8 @@ from tests.proof.recordings import VARIABLE
 from tests.truth import __main__ as truth
 from tests.truth import cases as made
 from tests.truth import judge, run
+from tests.truth.ablate import RULES, left_out, part_of
+from thermoctl.diagnosis.limits import limits
 
 
 def result(verdict: str, *names: tuple[str, str, float]) -> dict:
@@ -121,3 +124,14 @@ def test_the_command_compares_with_the_older_result(tmp_path, monkeypatch, capsy
     assert f"without real rigs: {VARIABLE}" in printed.err
     assert "- one: *named* a at x (0.970)" in printed.out and "consistent -> explained" in printed.out
     assert printed.out.count("| other people's systems |") == 2
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_rule_names_a_part_of_the_program_and_comes_back(name):
+    rule = RULES[name]
+    assert rule.without or rule.limits
+    dataclasses.replace(limits(), **rule.limits)
+    with left_out(rule):
+        inside = [part_of(path) for path in rule.without]
+    assert inside == [*rule.without.values()]
+    assert all(part_of(path) != other for path, other in rule.without.items())
