@@ -215,6 +215,12 @@ CASES = (
     Case("Tektronix TDS", "tek.csv", "".join(
         f"{k},{x},,{i}.0,{20 + i}.0,\n" for i, (k, x) in enumerate([("Record Length", "6"), ("Sample Interval", "1.0"), ("Source", "CH1"),
         ("Vertical Units", "V"), ("Horizontal Units", "s"), ("", "")])), {"CH1": RISING}, units={"CH1": "V"}),
+    Case("Tektronix MSO", "mso.csv", rows("Model,MSO54\n\nWaveform Type,ANALOG,,\nHorizontal Units,s,,\nSample Interval,0.1,,\nRecord Length,6,,\nVertical Units,A,V,\nLabel,,\nTIME,CH1,CH2\n",
+         "{h},{T},{P}"), {"CH1": RISING, "CH2": POWER}, [0, 0.1, 0.2, 0.3, 0.4, 0.5], {"CH1": "A", "CH2": "V"}),
+    Case("Siglent", "siglent.csv", rows("Record Length,Analog:6\nSample Interval,Analog:1.0E-01\nVertical Units,CH1:V,CH2:A\nHorizontal Units,s\nSource,CH1,CH2\nSecond,Volt,Ampere\n",
+         "{h},{T},{P}"), {"CH1": RISING, "CH2": POWER}, [0, 0.1, 0.2, 0.3, 0.4, 0.5], {"CH1": "V", "CH2": "A"}),
+    Case("Rigol MSO5000, values only", "mso5000.csv", rows("CH1V,CH2V,t0 = -0.5, tInc = 0.5,\n", "{T},{P},,"), {"CH1": RISING, "CH2": POWER},
+         [-0.5, 0, 0.5, 1, 1.5, 2], {"CH1": "V"}),
     Case("Teledyne LeCroy", "lecroy.csv", rows("LECROYWR104Xi,18,Waveform\nSegments,1,SegmentSize,6\nSegment,TrigTime,TimeSinceSegment1\n"
          "#1,01-Mar-2026 10:00:00,0\nTime,Ampl\n", "{i},{T}.0"), {"Ampl": RISING}),
     Case("Fluke 289 FlukeView", "fluke.csv", rows("Reading,Sample,Start Time,Duration,Max Time,Max\n", "{i},{T}.0 °C,3/1/2026 10:00:{s} AM,0:00:01.0,3/1/2026 10:00:{s} AM,{T}.5 °C"),
@@ -245,6 +251,10 @@ CASES = (
     Case("Home Assistant, history of the API", "history.json", json.dumps([[{"entity_id": e, "state": s, "last_changed": _ISO.format(t), "attributes": {}}
          for (e, s), t in zip(_HA, _HA_TIMES, strict=True) if e == x] for x in ("sensor.block", "switch.heater")]),
         {"sensor.block": [20, np.nan, 22, np.nan], "switch.heater": [0, np.nan, np.nan, 1]}, [0, 1, 2, 3]),
+    Case("Home Assistant, long-term statistics", "statistics.csv", rows("statistic_id,unit,start,mean,min,max\n", "sensor.block,°C," + DATE + " 10:00:{s},{T},0,99"),
+         {"sensor.block": RISING}, units={"sensor.block": "degC"}),
+    Case("Tasmota, Zigbee: JSON in JSON", "tele.jsonl", rows("", '{{"Time": "' + DATE + 'T10:00:{s}", "DS18B20": {{"Temperature": {T}}}, "TempUnit": "C"}}'),
+         {"DS18B20_Temperature": RISING}),
     Case("Grafana, series joined by time", "grafana.csv", rows('"Time","Block","Heater"\n', '"' + DATE + ' 10:00:{s}","{T} °C","{P} W"'),
          {"Block": RISING, "Heater": POWER}, units={"Block": "degC", "Heater": "W"}),
     Case("Grafana, a series a row", "series.csv", rows('"Series";"Time";"Value"\n', '"T";"' + DATE + 'T10:00:{s}Z";{T}'), {"T": RISING}),
@@ -260,6 +270,12 @@ CASES = (
     Case("Excel with a cover sheet", "cover.xlsx", _excel, {"T": RISING, "P": POWER}, units={"T": "degC"}),
     Case("Parquet with columns of every type", "mixed.parquet", _parquet, {"T": RISING, "P": POWER}),
     Case("Arduino Serial Plotter, milliseconds", "arduino.txt", rows("millis\tT\tP\n", "{k}\t{T}.0\t{P}"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),
+    Case("Arduino plotter, labels", "plotter.txt", rows("", "time_ms:{k} T:{T}.0 P:{P}"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),
+    Case("Campbell, array of parts of the date", "cr10x.dat", "year,doy,hhmm,T\n" + "".join(f"2026,60,{1000 + i},{20 + i}\n" for i in range(6)), {"T": RISING},
+         [60.0 * i for i in range(6)]),
+    Case("EnergyPlus", "eplusout.csv", "Date/Time,ROOM:Zone Mean Air Temperature [C](TimeStep)\n 03/01  23:50:00,20\n 03/01  24:00:00,21\n 03/02  00:10:00,22\n",
+         {"ROOM:Zone Mean Air Temperature": [20, 21, 22]}, [0, 600, 1200], {"ROOM:Zone Mean Air Temperature": "degC"}),
+    Case("Origin, names, units, comments", "origin.txt", rows("Time\tT\tP\ns\tdegC\tW\nrun 1\tblock\theater\n", "{i}\t{T}\t{P}"), {"T": RISING, "P": POWER}, units={"T": "degC", "P": "W"}),
     Case("gzip of a CSV", "run.csv.gz", gzip.compress(rows("time [s],T,P\n", "{i},{T},{P}").encode()), {"T": RISING, "P": POWER}),
     Case("JSON lines", "run.jsonl", rows("", '{{"time": "' + DATE + 'T10:00:{s}Z", "T": {T}, "P": {P}}}'), {"T": RISING, "P": POWER}),
 )  # fmt: skip

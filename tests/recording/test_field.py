@@ -90,6 +90,38 @@ CELLS = {
 }
 
 
+ODD = {  # a text, its times, a column of it
+    "minimum and mean below": ("t,T\n0,20\n1,21\n2,22\n3,23\nMin,20\nMean,21.5\n", [0, 1, 2, 3], "T", [20, 21, 22, 23]),
+    "a sum below a blank line": ("t,T\n0,20\n1,21\n\nMean:,20.5\n", [0, 1], "T", [20, 21]),
+    "header and units again": ("t,T\ns,degC\n0,20\n1,21\nt,T\ns,degC\n2,22\n3,23\n4,24\n", [0, 1, 2, 3, 4], "T", [20, 21, 22, 23, 24]),
+    "units with in": ("Zeit;Temp\nin min;in °C\n0;20\n1;21\n", [0, 60], "Temp", [20, 21]),
+    "blanks about quotes": ('"t" , "T"\n"0" , "20"\n"1" , "21"\n', [0, 1], "T", [20, 21]),
+    "a table of Markdown": ("| t | T |\n|---|---|\n| 0 | 20 |\n| 1 | 21 |\n", [0, 1], "T", [20, 21]),
+    "a unit without brackets": ("No.;Time;Temp. °C\n1;10:00:00;20\n2;10:00:01;21\n", [0, 1], "Temp.", [20, 21]),
+    "a step's number before the time": ("Time Step,T,flow-time\n0,20,0\n1,21,0.5\n2,22,1\n", [0, 0.5, 1], "T", [20, 21, 22]),
+    "date in parts": ("Jahr;Monat;Tag;Stunde;Minute;T\n2026;3;1;23;59;20\n2026;3;2;0;0;21\n", [0, 60], "T", [20, 21]),
+    "samples are a number, no interval": ("Samples\t600\nX_Value\tT\n0,0\t20,5\n0,5\t21,5\n1,0\t22,5\n1,5\t23,5\n", [0, 0.5, 1, 1.5], "T", [20.5, 21.5, 22.5, 23.5]),
+    "formulas of Excel": ('t;T\n="0";="20"\n="1";="21"\n', [0, 1], "T", [20, 21]),
+    "J and N": ("t;heater\n0;N\n1;J\n2;N\n", [0, 1, 2], "heater", [0, 1, 0]),
+    "milliseconds of a SCADA": ("Date,Time,Millitm,T\n" + "".join(f"03/01/2026,10:00:00,{k},{k}\n" for k in (0, 500)), [0, 0.5], "T", [0, 500]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text, t, name, values", ODD.values(), ids=ODD)
+def test_odd_files(tmp_path, text, t, name, values):
+    found = read(tmp_path, text)
+    np.testing.assert_allclose(found.t, t, atol=1e-9)
+    np.testing.assert_allclose(found.columns[name], values)
+
+
+def test_nothing_but_text_is_no_recording(tmp_path):
+    with pytest.raises(InputError, match="no column of numbers beside the time"):
+        read(tmp_path, "10:00:00  T0:20.0 /210.0\n10:00:01  T0:21.0 /210.0\n")
+    rows = [f"Tag {i} 10 Uhr,{20 + i},{30 + i}" for i in range(4)]
+    with pytest.raises(InputError, match="'Date/Time': 'Tag 0 10 Uhr' is no time .* clock is the column"):
+        read(tmp_path, table("Date/Time,block time,P", *rows))
+
+
 @pytest.mark.parametrize("cells, values", CELLS.values(), ids=CELLS)
 def test_cells_in_every_spelling(tmp_path, cells, values):
     found = read(tmp_path, table("time,x", *(f"{i},{c}" for i, c in enumerate(cells))))

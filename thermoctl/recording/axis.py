@@ -38,6 +38,18 @@ MILLI = 1000
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
 _OTHERS = WORDS["other_times"].split()
+MOST_WORDS = 3  # of a counter's name
+_FIELDS = {  # names of the parts of a date that have a column each
+    "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
+    "month": ("month", "mm", "mon", "monat", "mois", "mes", "mese"),
+    "day": ("day", "dd", "tag", "jour", "dia", "día", "giorno"),
+    "doy": ("doy", "julian", "jday", "julday", "day_of_year", "dayofyear", "jd"),
+    "hour": ("hour", "hh", "hr", "stunde", "heure", "hora", "ora"),
+    "hhmm": ("hhmm", "time", "hourmin", "hour_minute"),
+    "minute": ("minute", "min", "mi", "minuto", "minuti"),
+    "second": ("second", "ss", "sec", "sekunde", "seconde", "segundo", "secondo"),
+}
+_STEPS = ("step", "index", "number", "no", "nr", "count", "id", "idx")
 _PARTS = re.compile(r"[^\W\d_]+|#|n[°º]", re.UNICODE)
 
 
@@ -82,8 +94,13 @@ def named(name: str) -> int:
         return 0
     if any(w in _OTHERS for w in words):
         return -NAMED
+    if 1 < len(words) <= MOST_WORDS and words[-1] in _STEPS:  # `Time Step` counts
+        return COUNTED
     if re.fullmatch(r"t|ts|t[_ ]?(s|ms|us|ns|min|h|d|sec|msec)", name.strip()):
         return NAMED
+    words = [
+        w for k, w in enumerate(words) if w != "data" or k == 0
+    ]  # Italian for a date, English for values
     if any(w in _TIMES for w in words) or re.match(r"(?i)(date|time|zeit|datum|timestamp)", "".join(words)):
         return NAMED
     if "#" in name or any(w in _COUNTERS for w in words[:1]):
@@ -276,6 +293,36 @@ def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
             )
             whole = replace(seconds, t=t, start=start, note=seconds.note + " and milliseconds")
             yield _judged(sheet, (*columns, names[after]), whole, names.index(columns[0])).plus(2 * JOINED)
+    if (found := _of_parts(sheet)) is not None:
+        yield _judged(sheet, *found, 0).plus(2 * JOINED)
+
+
+def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
+    """Return a clock of columns year, month, day, hour ..., or year, day of the year, hhmm (Campbell)."""
+    at = {key: n for n in sheet.columns for key, names in _FIELDS.items() if n.strip().lower() in names}
+    if not {"year", "hour"} <= at.keys() and not {"year", "hhmm"} <= at.keys():
+        return None
+    if "doy" not in at and not {"month", "day"} <= at.keys():
+        return None
+    columns = {key: sheet.columns[n] for key, n in at.items()}
+    for key, c in columns.items():
+        if not isinstance(c, np.ndarray) or not np.isfinite(c).all() or (key != "second" and np.any(c % 1)):
+            return None
+    whole = {key: c.astype(np.int64) for key, c in columns.items() if key != "second"}
+    months = ((whole["year"] - 1970) * 12 + (whole["month"] - 1 if "doy" not in at else 0)).astype(
+        "datetime64[M]"
+    )
+    days = months.astype("datetime64[D]").astype(np.int64) + whole["doy" if "doy" in at else "day"] - 1
+    hour, minute = (
+        (whole["hhmm"] // 100, whole["hhmm"] % 100)
+        if "hhmm" in at
+        else (whole["hour"], whole.get("minute", 0))
+    )
+    t = days * 86_400.0 + hour * 3600.0 + minute * 60.0 + columns.get("second", 0.0)
+    start = str(np.datetime64(round(float(t[0]) * 1e3), "ms"))
+    used = [key for key in _FIELDS if key in at and not (key in ("month", "day") and "doy" in at)]
+    note = f"{', '.join(used)} put together, from {start.replace('T', ' ')}"
+    return tuple(at[key] for key in used), Seconds(t - t[0], start, note, "date and time")
 
 
 def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds]) -> Seconds | None:
@@ -314,7 +361,9 @@ def _fraction(sheet: Sheet, name: str) -> np.ndarray | None:
         or not len(values)
     ):
         return None
-    named = unit_of_time(name, sheet.units.get(name)) == "ms" or re.search(r"(?i)\bm(illi)?s(ec)?", name)
+    named = unit_of_time(name, sheet.units.get(name)) == "ms" or re.search(
+        r"(?i)\bm(illi)?s(ec)?|milli", name
+    )
     inside = values.min() >= 0 and values.max() < MILLI and np.all(values == np.round(values))
     return values / MILLI if named and inside else None
 

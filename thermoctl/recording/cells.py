@@ -63,7 +63,7 @@ def is_number(cell: str) -> bool:
 
 
 def _tidy_one(cell: str) -> str:
-    return re.sub(f"[{_SIGNS}]", "-", cell.strip().strip("\"'"))
+    return re.sub(f"[{_SIGNS}]", "-", re.sub(r'^="?([^"]*)"?$', r"\1", cell.strip().strip("\"'")))
 
 
 def _tidied(texts: pa.Array) -> pa.Array:

@@ -26,12 +26,17 @@ SEPARATORS = (",", ";", "\t", "|", "  ", " ")
 HEAD_LINES = 6  # above the data, of which names, units and the kind of value are taken
 UNIT_LENGTH = 16  # characters of a cell in a line of units
 _COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|NUM|REF|BEZUG|NULL)!))")
+_RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")  # below the header of a table in Markdown or SQL
+FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (Rigol)
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _KINDS = {"", *WORDS["kinds"].split()}
 _STEP = re.compile(
     r"(?i)^(?:.*(?:sampl\w*|scan|log\w*|record\w*|acqui\w*|mess|abtast)\w*[\s_-]*(?:interval|period|time|rate|freq\w*|clock|step|intervall|zeit|rate)?"
-    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency)\b.*$"
+    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|tinc|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency)\b.*$"
+)
+_INTERVAL = re.compile(
+    r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz"
 )
 _RATE = re.compile(r"(?i)rate|freq|hz")
 _VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
@@ -102,7 +107,8 @@ def cells_of(line: str, separator: str) -> list[str]:
                 c.strip() for c in next(csv.reader([line.strip()], delimiter=" ", skipinitialspace=True), [])
             ]
         return re.split(r"\s{2,}|\t" if separator == "  " else r"\s+", line.strip())
-    return [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
+    cells = [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
+    return [c[1:-1] if len(c) > 1 and c[0] == c[-1] == '"' else c for c in cells]
 
 
 def _sample(path: Path, text: str) -> tuple[list[tuple[int, str]], list[tuple[int, str]], str | None]:
@@ -115,6 +121,8 @@ def _sample(path: Path, text: str) -> tuple[list[tuple[int, str]], list[tuple[in
             continue
         if is_comment(line):
             comments.append((number, line.strip().lstrip("#% \t")))
+            continue
+        if _RULER.match(line):
             continue
         if not sample and (match := re.match(r"\"?sep=(.)\"?\s*$", line)):
             stated = match[1]
@@ -157,6 +165,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
     names, units, header, used = _header(path, head, comments, separator, width, data, facts, notes)
     if skipped := sum(1 for n, _ in head if n not in used):
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
+    facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
     decimal = _decimal(data, separator)
     if separator != ",":
         shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
@@ -214,7 +223,7 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
 
     def is_data(cells: list[str]) -> bool:
         """Return whether half of the cells that should be numbers or times are."""
-        if len(cells) != width:
+        if len(cells) != width or (kinds[0] == "-" and _kind(cells[0]) == "w"):
             return False
         if not expected:
             return all(_kind(c) == "-" for c in cells[1:]) and any(c for c in cells)
@@ -238,16 +247,21 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
     return len(rows)
 
 
+def _bare(cell: str) -> str:
+    """Return the unit of a cell such as `[degC]`, `(degC)` or `in degC`."""
+    return re.sub(r"^in\s+", "", cell.strip("[]() "))
+
+
 def _is_units(cells: list[str], above: list[str]) -> bool:
     """Return whether most cells of a line are units, and the line above it can be the header."""
-    bare = [c.strip("[]() ") for c in cells]
+    bare = [_bare(c) for c in cells]
     words = [c for c in bare if c and not is_number(c) and c.lower() not in ("ts", "rn") and named(c) == 0]
     right = sum(known(c) for c in bare)
     names = sum(bool(c) and (not is_number(c) or re.fullmatch(r"\d{1,3}", c) is not None) for c in above)
     return (
         all(len(c) <= UNIT_LENGTH for c in bare)
         and right > 0
-        and 2 * right >= len(words)
+        and 2 * right > len(words)
         and 2 * names >= len(above) > 1
     )
 
@@ -272,6 +286,8 @@ def _header(
     if not lines_of:
         notes.append("no header: the columns are called column_1, column_2 ...")
         return tuple(f"column_{i + 1}" for i in range(width)), {}, (), set()
+    if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):  # noqa: PLR2004
+        lines_of.pop()  # below the units (Origin)
     below: list[tuple[int, list[str]]] = []
     while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
         below.append(lines_of.pop())
@@ -290,9 +306,7 @@ def _header(
     units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}
     for number, row in below:
         if not _is_kinds(row):
-            stated = (
-                spelled(c.strip("[]()"), n) for c, n in zip(_widened(row, width, data), names, strict=True)
-            )
+            stated = (spelled(_bare(c), n) for c, n in zip(_widened(row, width, data), names, strict=True))
             units |= {n: u for n, u in zip(names, stated, strict=True) if u and known(u)}
             notes.append(f"line {number} read as units")
             _below(lines_of[-1][1], row, facts)
@@ -330,7 +344,7 @@ def _fits(cells: list[str], width: int, data: list[list[str]]) -> bool:
         return False
     more = {c.lower() for c in cells[width:]}
     known_more = len(cells) > width and (
-        more <= {"start", "increment", ""} or all(is_number(c) or not c for c in more)
+        more <= {"start", "increment", "comment", ""} or all(is_number(c) or not c for c in more)
     )
     return len(cells) in (width, width - 1) or filled == width or known_more
 
@@ -374,6 +388,11 @@ def _distinct(path: Path, line: int, names: list[str], data: list[list[str]]) ->
     return found
 
 
+def _is_remarks(cells: list[str]) -> bool:
+    """Return whether a line holds neither names of times, nor units, nor kinds of values."""
+    return not _is_kinds(cells) and not any(known(_bare(c)) or split_words(c)[1] or named(c) for c in cells)
+
+
 def _is_kinds(cells: list[str]) -> bool:
     return all(c.lower() in _KINDS for c in cells) and len({c.lower() for c in cells}) <= len(_KINDS)
 
@@ -415,21 +434,39 @@ def _below(cells: list[str], row: list[str], facts: dict[str, list[str]]) -> Non
 
 
 def _aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str]) -> dict[str, str]:
-    """Return units of a line above the header that names them by column (LVM: Y_Unit_Label)."""
+    """Return units of lines above the header that name them by column: LVM, oscilloscopes."""
+    found: dict[str, str] = {}
     for key, values in facts.items():
-        if re.search(r"(?i)^(y_?)?(unit|einheit|vunit)", key) and any(known(v) for v in values):
-            return {
-                n: str(spelled(v, n))
-                for n, v in zip(names[1:], values, strict=False)
-                if known(v) and n not in units
+        if re.search(r"(?i)^(y_?|vert\w*[ _]?|v)?(unit|einheit)", key) and any(
+            known(_own(v)) for v in values
+        ):
+            while len(values) > len(names) - 1 and not values[-1]:
+                values = values[:-1]
+            columns = names if len(values) == len(names) else names[1:]
+            found |= {
+                n: str(spelled(_own(v), n))
+                for n, v in zip(columns, values, strict=False)
+                if known(_own(v)) and n not in units
             }
-    return {}
+        elif (
+            re.search(r"(?i)^(x_?|hor\w*[ _]?|h)(unit|einheit)", key)
+            and spelled(values[0]) in SECONDS
+            and names[0] not in units
+            and named(names[0]) > 0
+        ):
+            found[names[0]] = str(spelled(values[0]))
+    return found
+
+
+def _own(unit: str) -> str:
+    """Return the unit of `CH1:V` (Siglent) and of `V`."""
+    return unit.rpartition(":")[2]
 
 
 def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
     """Return the interval between rows that a file states above its header, and the first time, s."""
     start = 0.0
-    for key in ("start", "x0", "xoffset", "hoffset", "trigger offset"):
+    for key in ("start", "x0", "t0", "xoffset", "hoffset", "trigger offset"):
         if key in facts and (match := _VALUE.match(facts[key][0])):
             start = float(match[1].replace(",", "."))
     for key, values in facts.items():
@@ -440,7 +477,11 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
         if match is None:
             continue
         size = float(match[1].replace(",", "."))
-        stated = match[2] or (filled[1] if len(filled) > 1 else "") or (split_unit(key)[1] or "")
+        if not _INTERVAL.search(key) and spelled(match[2]) not in SECONDS:
+            continue  # `Samples 600` is their number, `Sampling 1s` an interval
+        stated = (
+            match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
+        )
         unit = spelled(stated) or ("Hz" if _RATE.search(key) else "s")
         if unit in SECONDS and size > 0 and "rate" not in key:
             return size * SECONDS[unit], start

@@ -28,6 +28,11 @@ _POINT = re.compile(
     r"^(?P<head>(?:\\.|[^\s\\])+) (?P<fields>(?:\\.|\"(?:\\.|[^\"\\])*\"|[^\s\\\"])+)(?: (?P<time>-?\d+))?$"
 )
 _STATS = re.compile(r"^(?:[^\n]*?[ \t])?Stats (\d+\.\d+): (.*)$", re.MULTILINE)
+_LABEL = r"([A-Za-z_]\w*):\s?([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+_LABELS = re.compile(
+    r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
+    re.MULTILINE,
+)
 LEAD = 65536  # bytes that decide
 _GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
 
@@ -53,9 +58,21 @@ def _word(value: Any) -> str:
 
 
 def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
-    names = list(dict.fromkeys(k for r in records for k, v in r.items() if not isinstance(v, dict | list)))
+    records = [_flat(r) for r in records]
+    names = list(dict.fromkeys(k for r in records for k in r))
     columns = {n: [r.get(n) for r in records] for n in names}
     return _sheet(path, columns, lambda row: f"{path}: record {row + 1}")
+
+
+def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's values; those of a record inside it are called `outer_inner`."""
+    found: dict[str, Any] = {}
+    for key, value in record.items():
+        if isinstance(value, dict):
+            found |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
+        elif not isinstance(value, list):
+            found[key] = value
+    return found
 
 
 def _json(path: Path, text: str) -> list[Sheet] | None:
@@ -229,6 +246,18 @@ def _klipper(path: Path, text: str) -> list[Sheet] | None:
     return [sheet]
 
 
+def _labelled(path: Path, text: str) -> list[Sheet] | None:
+    """Read the lines `T:20.1,P:3` of Arduino's plotter, with or without its monitor's time before them."""
+    records = []
+    for line in filter(str.strip, text.splitlines()):
+        match = _LABELS.fullmatch(line.strip())
+        if match is None:
+            return None
+        stamp = {"time": match["stamp"]} if match["stamp"] else {}
+        records.append(stamp | dict(re.findall(_LABEL, match["labels"])))
+    return [_records(path, records)]
+
+
 def _tektronix(path: Path, text: str) -> list[Sheet] | None:
     """Read the table of a Tektronix TDS: key, value, empty, time, value in each line."""
     rows = [cells_of(x, ",") for x in text.splitlines() if x.strip()]
@@ -250,6 +279,7 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
     (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
     (re.compile(r"\A\"?Record Length\"?,"), _tektronix),
+    (re.compile(rf"\A{_LABELS.pattern}\s*$", re.MULTILINE), _labelled),
 )
 
 

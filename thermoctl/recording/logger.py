@@ -30,6 +30,7 @@ from thermoctl.recording.axis import Clock
 from thermoctl.recording.cells import CellError
 from thermoctl.recording.clock import ClockError
 from thermoctl.recording.dialect import (
+    FACT,
     Dialect,
     cells_of,
     decoded,
@@ -119,6 +120,7 @@ def read_recording(
     return _renamed(table, columns or {})
 
 
+_SINCE = re.compile(r", from \d{4}-\d\d-\d\d [\d:.]+( UTC)?")
 _TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", "")
 
 
@@ -303,6 +305,7 @@ def _described(dialect: Dialect) -> str:
 def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:
     """Return a sheet with the units and the interval of its dialect; of a long table one a signal."""
     sheet.units = dict(dialect.units)
+    sheet.columns = {n: c for n, c in sheet.columns.items() if not FACT.match(n)}
     sheet.decimal = dialect.decimal or ("," if dialect.separator == ";" else None)
     if (stated := stated_step(dialect.facts)) is not None:
         sheet.step_s, sheet.offset_s = stated
@@ -368,13 +371,13 @@ def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
     headers = (list(dialect.header), [c for c in dialect.header if c])
     rows: list[tuple[int, list[str]]] = []
     odd: list[tuple[int, list[str]]] = []
-    again: list[str] = []
+    again: list[int] = []
     notes: list[str] = []
     for line, content in lines(text.decode("utf-8")):
         found = cells_of(content, dialect.separator) if line >= dialect.first else []
         found = found[:-1] if len(found) == width + 1 and not found[-1] else found
-        if found and found in headers:
-            again.append(str(line))
+        if found and (found in headers or (again and again[-1] == line - 1 and not _any_value(found))):
+            again.append(line)
         elif any(found):
             (rows if len(found) == width else odd).append((line, found))
     while len(rows) > 1 and _is_footer(rows[-1][1], rows[0][1]):
@@ -390,20 +393,22 @@ def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
             f"{len(odd[0][1])} cells of {width}, or words only (was the file cut off?)"
         )
     if again:
-        notes.append(f"the header stands again in line {', '.join(again[:5])}; left out")
+        notes.append(f"the header stands again in line {', '.join(map(str, again[:5]))}; left out")
     numbers = [n for n, _ in rows]
     columns = {n: pa.array([r[i] for _, r in rows], pa.string()) for i, n in enumerate(dialect.names)}
     return Sheet(dict(columns), lambda row: f"{path}:{numbers[min(row, len(numbers) - 1)]}", notes=notes)
 
 
 def _is_footer(row: Sequence[str], first: Sequence[str]) -> bool:
-    """Return whether a row holds words only, where the first one holds numbers or times."""
+    """Return whether a row holds words only, or begins with one where the first row has a number or time."""
+    if _any_value(first) and not _any_value(row):
+        return any(not cells.is_missing(c) for c in row)
+    return _any_value(first[:1]) and not _any_value(row[:1]) and not cells.is_missing(row[0])
 
-    def any_value(cells_: Sequence[str]) -> bool:
-        """Return whether a cell is a number or a time."""
-        return any(cells.is_number(c) or clock.is_time(c) for c in cells_)
 
-    return any_value(first) and not any_value(row) and any(not cells.is_missing(c) for c in row)
+def _any_value(row: Sequence[str]) -> bool:
+    """Return whether a cell is a number or a time."""
+    return any(cells.is_number(c) or clock.is_time(c) for c in row)
 
 
 # ------------------------------------------------------------------------------------------- cells, clock, table
@@ -430,9 +435,15 @@ def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str])
     if not parts:
         raise InputError(f"{path}: no channels with a time; at least one was expected")
     table = parts[0] if len(parts) == 1 else _united(path, parts)
+    if not table.columns:
+        text = ", ".join(n for s in sheets for n in s.columns if not isinstance(s.columns[n], np.ndarray))
+        raise InputError(f"{path}: no column of numbers beside the time; columns of text: {text or 'none'}")
     if not len(table):
         raise InputError(f"{path}: no rows; at least one sample was expected")
-    every = tuple(dict.fromkeys([*notes, *later, *(n for p in parts for n in p.notes)]))
+    alike: dict[str, str] = {}  # of clocks that differ by their start the earliest
+    for note in (n for p in parts for n in p.notes):
+        alike[_SINCE.sub("", note)] = min(note, alike.get(_SINCE.sub("", note), note))
+    every = tuple(dict.fromkeys([*notes, *later, *alike.values()]))
     how.trace.extend(f"note: {n}" for n in every)
     return replace(table, notes=every)
 
@@ -563,13 +574,20 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
 
 
 def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
-    """Refuse a counter as the clock beside times that cannot be read."""
-    for name, word in sheet.left.items() if counter.counter else ():
+    """Refuse a counter, or a number of no unit, as the clock beside times that cannot be read."""
+    sure = not counter.counter and (counter.seconds.kind != "bare" or any(map(_plain_time, counter.columns)))
+    for name, word in () if sure or not counter.why else sheet.left.items():
         if axis.named(name) > 0 and any(c.isdigit() for c in word):
+            what = "counter" if counter.counter else "column"
             raise InputError(
-                f"{sheet.place(0)}: column '{name}': '{word}' is no time in a form that is known, and the only other "
-                f"clock is the counter {counter.where}; name that with --time, or write the times in seconds"
+                f"{sheet.place(0)}: column '{name}': '{word.strip()}' is no time in a form that is known, and the only other "
+                f"clock is the {what} {counter.where}; name that with --time, or write the times in seconds"
             )
+
+
+def _plain_time(name: str) -> bool:
+    """Return whether a name is a time and nothing else, such as `t`, `Time` or `Zeit`."""
+    return axis.named(name) > 0 and len(axis.tokens(name)) == 1
 
 
 def _moved(start: str, seconds: float) -> str:

@@ -57,6 +57,7 @@ _SYMBOL = (
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
 _UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
+_LAST = re.compile(r"(.*[^\s,(\[/])\s+(°\s?[CF]|℃|℉)$|(CH\d+)([VA])$")  # `Temp. °C`; CH1V of an oscilloscope
 _SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Seconds of a unit of time."""
@@ -98,7 +99,12 @@ def split_unit(header: str) -> tuple[str, str | None]:
 
 def split_words(header: str) -> tuple[str, str | None]:
     """Return name and unit of a header that also may be `Temp, °C (LGR S/N: 7)` or `Spannung in V`."""
-    text = re.sub(r"\s*\((?:LGR|SEN|LBL)[^)]*\)", "", header.strip())
+    text = re.sub(
+        r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)", "", header.strip()
+    )
+    if match := _LAST.match(text):
+        name, unit = match[1] or match[3], match[2] or match[4]
+        return (text, None) if re.search(r"\bin$", name) else (name, spelled(unit, name))
     name, unit = split_unit(text)
     if (
         unit is None
