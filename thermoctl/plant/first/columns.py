@@ -34,6 +34,7 @@ UNITS = {
 }
 """The unit of each kind in a plant file."""
 KELVIN = (250.0, 400.0)  # temperatures without a unit that never leave this span are taken as kelvin
+FULL_SCALE = 1.001  # largest value of a share over its full scale
 COLDEST, HOTTEST = -90.0, 2000.0  # plausible temperatures of a sensor, degC
 LEAST_ROWS = 8
 _ENERGY = dimension("J")
@@ -48,16 +49,20 @@ _STEMS = {
     "torque": "torque drehmoment coppia koppel",
     "force": "force kraft fuerza forza forca kracht thrust",
     "velocity": "speed velocity geschwindig drehzahl vitesse velocit velocid snelheid hastighet predkosc omega",
-    "flow": "inflow outflow durchfluss volumenstrom debit portata caudal vazao zufluss zulauf flode przeplyw "
-    "pump pompe pompa bomba flow",
+    "flow": "inflow outflow durchfluss volumenstrom debit portata caudal vazao zufluss zulauf flode przeplyw flow",
     "level": "level fullstand fuellstand pegel niveau livello nivel niva poziom",
     "position": "position posizion posicion posicao pozycj displace deplace spostament desplaz deslocam verschieb "
-    "verplaats stroke travel encoder abstand distanc distanz",
+    "verplaats stroke travel abstand distanc distanz",
     "voltage": "voltage volts spannung tension tensione tensao voltaj spanning spanning napieci",
     "current": "current strom courant corrente corriente stroom amper amps intensite intensidad natezen",
     "duty": "duty pwm tastgrad percent",
-    "power": "power leistung puissance potenza potencia vermogen effekt heat heiz chauff chaleur riscald calef "
-    "calor aquec verwarm varme grzej grzan grzal watt warme waerme",
+    "power": "power leistung puissance potenza potencia vermogen effekt watt",
+}
+_DEVICES = {  # a name of the thing alone: the pump's power is a power
+    "flow": "pump pompe pompa bomba",
+    "position": "encoder",
+    "power": "heat heiz chauff chaleur riscald calef calor aquec verwarm varme grzej grzan grzal warme waerme boiler "
+    "kessel radiator furnace burner brenner relay relais ssr",
 }
 _WORDS = {
     "setpoint": "set sp soll ref setp",
@@ -74,6 +79,7 @@ _WORDS = {
     "duty": "duty pwm pct",
     "power": "p q pel moc power",
 }
+_SHARES = {1.0: "1", 100.0: "%"}  # ends of a duty's scale, and the unit
 _AIR = (  # the surroundings, furthest out first: the room of a building is a body
     "outside outdoor outdoors exterior extern esterno esterna externo externa exterieur exterieure dehors aussen "
     "buiten ute utomhus zewnatrz venkovni weather wetter",
@@ -183,7 +189,10 @@ def _column(table: Table, name: str, stated: str) -> Column:
         return Column(
             name, "temperature", guess, f"'{name}' has no unit; {guess} by its name and values", outside
         )
-    if kind in ("power", "duty"):
+    if kind == "duty" or (kind == "power" and set(np.unique(values)) == {0.0, 1.0}):
+        share = next((unit for full, unit in _SHARES.items() if low >= 0 and high <= full * FULL_SCALE), "")
+        return Column(name, "duty", share, f"'{name}' has no unit; a share of full by its name and values")
+    if kind == "power":
         return Column(name, "power", "", "")
     if kind in ("current", "voltage", "force", "torque"):
         return Column(name, kind, UNITS[kind], f"'{name}' has no unit; {UNITS[kind]} by its name")
@@ -202,7 +211,7 @@ def _kind_of_name(found: Sequence[str]) -> str:
             w.startswith("temp") and w not in ("temps", "tempo") or w.endswith("temp") for w in found
         ):
             return kind
-    return ""
+    return next((k for k, d in _DEVICES.items() if any(s in w for w in found for s in d.split())), "")
 
 
 def _outside(found: Sequence[str]) -> int:
@@ -243,8 +252,10 @@ def quoted(text: str) -> str:
 def identifiers(columns: Sequence[str]) -> dict[str, str]:
     """Return a name of the plant language for each column."""
     found: dict[str, str] = {}
-    for c in columns:
-        name = re.sub(r"\W+", "_", _ascii(c.translate(_SPELLED)), flags=re.ASCII).strip("_") or "x"
+    last = [re.split(r"[./]", c)[-1] for c in columns]  # sensor.room, Model/T: without what is above it
+    for c, end in zip(columns, last, strict=True):
+        c_short = end if re.match(r"\D", end) and last.count(end) == 1 else c
+        name = re.sub(r"\W+", "_", _ascii(c_short.translate(_SPELLED)), flags=re.ASCII).strip("_") or "x"
         name = f"q_{name}" if name[0].isdigit() or name in ("t", "pi") else name
         while name in found.values():
             name += "_2"

@@ -58,6 +58,8 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
             f"  rest: {{value: 0, unit: {unit_x}}}  # confirm: the position at which the spring is relaxed"
         )
     start = f"first({ids[speed.name]}), initial_sigma: {_spread(speed.values(table))}" if speed else "0"
+    if place and not speed:  # a recording may start in motion
+        start += f", initial_sigma: {_pace(table.t, place.values(table)):.2g}"
     lines += ["nodes:", f"  speed: {{unit: {unit_v}, storage: {size}, initial: {start}}}"]
     if place:
         x = place.values(table)
@@ -83,6 +85,12 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
                 f"  {ids[c.name]}: {{value: {node}, {c.keys(ids[c.name])}{noise(c.values(table))}}}{confirm(c.doubt)}"
             )
     return lines
+
+
+def _pace(t: np.ndarray, x: np.ndarray) -> float:
+    """Return the size of the speed, from the places in a hundred parts of a recording."""
+    at = np.linspace(0, len(t) - 1, min(len(t), 100)).astype(int)
+    return max(float(np.std(np.diff(x[at]) / np.diff(t[at]))), 1e-12)
 
 
 def _spread(values: np.ndarray) -> str:

@@ -20,11 +20,14 @@ TEMPLATES = ("block", "motor", "hot-end", "room", "tank", "stage", "flexure", "a
 _PLACES = (
     "winding wicklung bobinage enroulement avvolgimento bobinado devanado wikkeling coil spule bobine bobina stator",
     "housing gehause gehaeuse carter boitier carcasa alloggiamento behuizing case casing frame body",
-    "block bloc blocco bloque blok hotend nozzle extruder duse duese heater",
+    "block bloc blocco bloque blok hotend nozzle extruder duse duese",
     "core kern noyau nucleo anker",
     "room raum salle stanza sala kamer zimmer indoor inside innen interieur interno interior living wohnzimmer",
     "fan lufter luefter ventilateur ventola ventilador",
+    "bed bett heizbett druckbett plate lit letto cama",
 )
+_FAN = 5
+SAME = 1.5  # score beyond which a name says that it is the same place
 _MOST = 7  # columns of one kind that are tried in every order
 
 
@@ -49,7 +52,8 @@ def mapped(
                 f"--columns {own}: template '{name}' has no such input or output{suggest(own, [r.name for r in plant.readings()])}"
             )
     found = _assigned(plant, columns, chosen)
-    lacking = [i for i in plant.inputs.values() if i.name not in found and i.role != "ambient"]
+    optional = [i for i in plant.inputs.values() if i.role == "ambient" or _is_fan(i.name)]
+    lacking = [i for i in plant.inputs.values() if i.name not in found and i not in optional]
     if lacking:
         raise InputError(
             f"{table.path}: template '{name}' reads '{lacking[0].name}' [{lacking[0].unit}]; no column is recognised as it "
@@ -64,8 +68,15 @@ def mapped(
     for item in plant.readings():
         if item.name in found:
             content = _with_column(content, item, found[item.name], item.name in chosen)
+        elif isinstance(item, Input) and item.role == "ambient":
+            warm = [
+                found[o].values(table)[0]
+                for o in plant.outputs
+                if o in found and _kind(plant.outputs[o]) == "temperature"
+            ]
+            content = _fixed(content, item, min(map(float, warm)), "temperature of the air")
         elif isinstance(item, Input):
-            content = _without_ambient(content, item, table, [found[o] for o in plant.outputs if o in found])
+            content = _fixed(content, item, 0.0, f"no column is recognised as '{item.name}': off")
         else:
             content = _without_output(content, item, next(o for o in plant.outputs if o in found))
     used = {c.name for c in found.values()}
@@ -76,7 +87,12 @@ def _assigned(plant: Plant, columns: Mapping[str, Column], chosen: Mapping[str, 
     """Return the column of each input and output: the assignment with the largest score."""
     found = {own: columns[c] for own, c in chosen.items()}
     free = [c for c in columns.values() if c not in found.values()]
-    for group in {(_kind(r), r.role == "ambient") for r in plant.readings()}:
+    groups = dict.fromkeys((_kind(r), r.role == "ambient") for r in plant.readings())
+    # The surroundings first, which are no body; drives last, since their names may repeat those of bodies.
+    for group in sorted(groups, key=lambda g: (not g[1], g[0] != "temperature")):
+        bodies = [
+            set(words(c.name)) for own, c in found.items() if c.kind == "temperature" and own in plant.outputs
+        ]
         items = [
             r for r in plant.readings() if r.name not in found and (_kind(r), r.role == "ambient") == group
         ]
@@ -85,13 +101,12 @@ def _assigned(plant: Plant, columns: Mapping[str, Column], chosen: Mapping[str, 
             fits = sorted((c for c in fits if c.outside), key=lambda c: -c.outside)[:1]
         elif group[0] == "temperature":
             inner = [c for c in fits if not c.outside]
-            fits = (
-                inner if len(inner) >= len(items) or not inner else [*inner, *(c for c in fits if c.outside)]
-            )
+            outer = [c for c in fits if c.outside and any(_score(i, c) > SAME for i in items)]
+            fits = inner if len(inner) >= len(items) else [*inner, *outer]
         fits = fits[:_MOST]
         best = max(
             permutations([*fits, *[None] * len(items)], len(items)),
-            key=lambda p: sum(_score(r, c) for r, c in zip(items, p, strict=True)),
+            key=lambda p: sum(_score(r, c) + _shared(c, bodies) for r, c in zip(items, p, strict=True)),
             default=(),
         )
         found |= {r.name: c for r, c in zip(items, best, strict=True) if c is not None}
@@ -110,15 +125,19 @@ def _kind(item: Input | Output) -> str:
 
 def _fits(c: Column, kind: str, ambient: bool) -> bool:
     if kind in ("angle", "duty"):  # a share: of a heater or of a fan
-        return (
-            c.kind in ("duty", "power")
-            and c.unit in ("", "%", "1")
-            or c.kind == ""
-            and bool(set(words(c.name)) & set(_PLACES[5].split()))
-        )
+        return c.kind in ("duty", "power") and c.unit in ("", "%", "1") or (c.kind == "" and _is_fan(c.name))
     if ambient:
         return c.kind == kind and bool(c.outside)
     return c.kind == kind
+
+
+def _shared(c: Column | None, bodies: Sequence[set[str]]) -> float:
+    """Return a part of a score for the words that a column shares with those of bodies."""
+    return 0.2 * max((len(set(words(c.name)) & b) for b in bodies), default=0) if c else 0.0
+
+
+def _is_fan(name: str) -> bool:
+    return bool(set(words(name)) & set(_PLACES[_FAN].split()))
 
 
 def _score(item: Input | Output, c: Column | None) -> float:
@@ -126,6 +145,8 @@ def _score(item: Input | Output, c: Column | None) -> float:
     if c is None:
         return 0.0
     own, its = set(words(item.name)), words(c.name)
+    if _is_fan(item.name) != _is_fan(c.name):
+        return -1.0  # rather none
     places = [set(p.split()) for p in _PLACES]
     same = any(own & p and any(w in p or any(len(q) > 4 and q in w for q in p) for w in its) for p in places)
     other = any(not own & p and any(w in p for w in its) for p in places)
@@ -144,13 +165,10 @@ def _with_column(content: str, item: Input | Output, c: Column, chosen: bool) ->
     return content.replace(match[0], f"{match[1]}{keys}{match[2]}{confirm(doubt) or match[3]}", 1)
 
 
-def _without_ambient(content: str, item: Input, table: Table, outputs: Sequence[Column]) -> str:
-    """Return the text with the temperature of the air as a parameter."""
-    first = min(float(c.values(table)[0]) for c in outputs if c.kind == "temperature")
+def _fixed(content: str, item: Input, value: float, what: str) -> str:
+    """Return the text with an input that was not recorded as a parameter."""
     content = content.replace(_line(content, item.name)[0] + "\n", "", 1)
-    line = (
-        f"parameters:\n  {item.name}: {{value: {first:.4g}, unit: degC}}  # confirm: temperature of the air\n"
-    )
+    line = f"parameters:\n  {item.name}: {{value: {value:.4g}, unit: {quoted(item.unit or '1')}}}  # confirm: {what}\n"
     return content.replace("parameters:\n", line, 1)
 
 

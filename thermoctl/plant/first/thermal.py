@@ -17,7 +17,7 @@ from itertools import combinations
 
 import numpy as np
 
-from thermoctl.plant.first.columns import Column, identifiers, noise
+from thermoctl.plant.first.columns import Column, identifiers, noise, words
 from thermoctl.recording.table import Table
 
 MARGIN = 5.0  # the ranges of a first guess reach from value / MARGIN to value * MARGIN
@@ -46,7 +46,9 @@ def draft(table: Table, drives: Sequence[Column], air: Column | None, sensors: S
     heats = [_heat(table, c, ids, drives) for c in drives]
     heats = [h for h in heats if h.rate]
     around = air.values(table) if air else np.full(len(table), min(v[0] for v in readings.values()))
-    capacity, conductance = _sizes(table.t, [h.size for h in heats], list(readings.values()), around)
+    column_of = {c.name: ids[c.name] for c in sensors}
+    heated = [_heated(table.t, h, readings, column_of) for h in heats]
+    sizes = _sizes_of_bodies(table.t, heats, heated, readings, around)
     margin = MARGIN * (1.0 if all(h.known for h in heats) else UNKNOWN_SCALE)
     bodies = {s: _body(s, set(ids.values())) for s in readings}
     ambient = ids[air.name] if air else "T_ambient"
@@ -63,20 +65,22 @@ def draft(table: Table, drives: Sequence[Column], air: Column | None, sensors: S
         lines.append(
             f"  T_ambient: {{value: {around[0]:.4g}, unit: degC}}  # confirm: temperature of the air"
         )
-    for body in names:
+    for sensor, body in bodies.items():
+        capacity, conductance = sizes[sensor]
         lines += [
             parameter(f"C_{body}", capacity, "J/K", margin),
             parameter(f"G_{body}", conductance, "W/K", margin, ABSENT),
         ]
-    lines += [parameter(f"G_{a}_{b}", conductance, "W/K", margin * MARGIN, ABSENT) for a, b in links]
+    typical = float(np.mean([g for _, g in sizes.values()]))
+    lines += [parameter(f"G_{a}_{b}", typical, "W/K", margin * MARGIN, ABSENT) for a, b in links]
     lines.append("nodes:")
     for sensor, body in bodies.items():
         lines.append(
             f"  {body}: {{unit: degC, storage: C_{body}, initial: first({sensor}), initial_sigma: 0.5}}"
         )
     lines.append("flows:")
-    for h in heats:
-        body = bodies[_heated(table.t, h.size, readings)]
+    for h, sensor in zip(heats, heated, strict=True):
+        body = bodies[sensor]
         lines.append(
             f"  heat_{ids[h.column.name]}: {{into: {body}, rate: {h.rate}, unit: W}}  # confirm: it heats '{body}'"
         )
@@ -152,6 +156,23 @@ def _heat(table: Table, c: Column, ids: Mapping[str, str], drives: Sequence[Colu
     return _Heat(c, name, "", values, True)
 
 
+def _sizes_of_bodies(
+    t: np.ndarray,
+    heats: Sequence[_Heat],
+    heated: Sequence[str],
+    readings: Mapping[str, np.ndarray],
+    air: np.ndarray,
+) -> dict[str, tuple[float, float]]:
+    """Return capacity and conductance by sensor: of all bodies together, or of one with a heat of its own."""
+    every = _sizes(t, [h.size for h in heats], list(readings.values()), air)
+    found = dict.fromkeys(readings, every)
+    if len(set(heated)) > 1:
+        for sensor in set(heated):
+            own = [h.size for h, s in zip(heats, heated, strict=True) if s == sensor]
+            found[sensor] = _sizes(t, own, [readings[sensor]], air)
+    return found
+
+
 def _sizes(
     t: np.ndarray, heats: Sequence[np.ndarray], sensors: Sequence[np.ndarray], air: np.ndarray
 ) -> tuple[float, float]:
@@ -174,9 +195,16 @@ def _sizes(
     return float(capacity), float(conductance)
 
 
-def _heated(t: np.ndarray, power: np.ndarray, sensors: Mapping[str, np.ndarray]) -> str:
-    """Return the sensor whose rise over the recording follows the supplied energy most."""
-    steps = max(len(t) // 200, 1)
+def _heated(t: np.ndarray, heat: _Heat, sensors: Mapping[str, np.ndarray], ids: Mapping[str, str]) -> str:
+    """Return the sensor that shares most words with the heat's name, else the one that follows it most.
+
+    `ids`: name in the plant by column."""
+    own = set(words(heat.column.name))
+    shared = {name: len(own & set(words(column))) for column, name in ids.items()}
+    first = max(shared.values())
+    if first and list(shared.values()).count(first) == 1:
+        return max(shared, key=lambda name: shared[name])
+    power, steps = heat.size, max(len(t) // 200, 1)
 
     def rise(values: np.ndarray) -> float:
         """Return the covariance of a temperature's rate and the power, K W/s."""
