@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from tests.checks.rigs import PLANTS, inputs, rig
 from thermoctl.advice.plan import plan
 from thermoctl.cli import main
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.plant import load, loads
+from thermoctl.plant import load, loads, save
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.shipped import shipped
@@ -69,6 +70,19 @@ def test_ratios_are_not_identified_and_a_better_course_is_better():
     assert np.mean([np.log(better.sd[p.name] / p.sd) for p in found.parameters]) < 0
 
 
+def test_trusted_sensors_have_no_faults(tmp_path):
+    text = PLANTS["two blocks"].replace("inputs:", "sensors: trusted\ninputs:", 1)
+    plant = loads(text)
+    save(plant, tmp_path / "plant.yaml")
+    assert load(tmp_path / "plant.yaml").trusted and not loads(PLANTS["two blocks"]).trusted
+    _, doubted = planned(rig("two blocks")[0], inputs("two blocks"))
+    _, trusted = planned(plant, inputs("two blocks"))
+    faults = {key for key in doubted if key[0].startswith("sensor_") or key[0] == "cold_junction_drift"}
+    assert len(faults) > 5 and trusted.keys() == doubted.keys() - faults
+    with pytest.raises(InputError, match="sensors.*trusted"):
+        loads(text.replace("trusted", "right"))
+
+
 def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys):
     path = tmp_path / "plant.yaml"
     path.write_text(PLANTS["one block"])
@@ -78,7 +92,12 @@ def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys
         told["duration_s"] > 10 * told["slowest_time_constant_s"] and told["visible"] and told["parameters"]
     )
     assert main(["plan", "--plant", str(path), "--limit", "heat=0:3"]) == 0
-    assert "smallest size" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    shares = [float(x) for x in re.findall(r"([\d.e+-]+) % of", printed)]
+    assert len(shares) > 3 and shares == sorted(shares, reverse=True) and "(K)" not in printed
+    assert all(
+        v["moves"]["share"] > 0 and v["moves"]["output"] in load(path).outputs for v in told["visible"]
+    )
     assert main(["plan", "--plant", str(path)]) == 2
     assert "--limit NAME=LOW:HIGH" in capsys.readouterr().err
 

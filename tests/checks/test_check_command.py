@@ -38,7 +38,7 @@ def test_plant_check_with_data(folder, capsys):
 def test_diagnose_stops_at_a_severe_finding(folder, capsys, monkeypatch):
     given = {}
 
-    def diagnosed(plant, tables, *_):
+    def diagnosed(plant, tables, *_, **__):
         given["tables"] = tables
         return {"verdict": "consistent"}
 
@@ -55,6 +55,27 @@ def test_diagnose_stops_at_a_severe_finding(folder, capsys, monkeypatch):
     assert "severe: swapped.csv" in printed.err and json.loads(printed.out) == {"verdict": "consistent"}
     assert cli.main([*args, "run.csv"]) == 0
     assert "severe" not in capsys.readouterr().err and [t.path for t in given["tables"]] == ["run.csv"]
+
+
+def test_refit_stops_and_simulate_warns_at_the_same_findings(folder, capsys):
+    args = ["refit", "--plant", "p.yaml", "--out", "fitted.yaml"]
+    assert cli.main([*args, "swapped.csv"]) == 2
+    printed = capsys.readouterr().err
+    assert "severe: swapped.csv" in printed and "refit with --anyway" in printed
+    assert not (folder / "fitted.yaml").exists()
+    assert cli.main([*args, "run.csv", "--held-out", "swapped.csv"]) == 2
+    assert cli.main([*args, "swapped.csv", "--anyway"]) == 0 and (folder / "fitted.yaml").exists()
+    capsys.readouterr()
+    assert cli.main([*args, "run.csv"]) == 0 and "severe" not in capsys.readouterr().err
+    assert cli.main(["simulate", "--plant", "p.yaml", "swapped.csv"]) == 0
+    printed = capsys.readouterr()
+    assert "severe: swapped.csv" in printed.err and "rms error" in printed.out
+    lines = (folder / "run.csv").read_text().splitlines()
+    keep = [k for k, name in enumerate(lines[0].split(",")) if not name.startswith("temperature")]
+    inputs = [",".join(line.split(",")[k] for k in keep) for line in lines]
+    (folder / "inputs.csv").write_text("\n".join(inputs))
+    assert cli.main(["simulate", "--plant", "p.yaml", "inputs.csv"]) == 0
+    assert "severe" not in capsys.readouterr().err
 
 
 def test_folders_of_rigs_take_no_column_options(folder, capsys):

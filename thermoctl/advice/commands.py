@@ -66,12 +66,7 @@ def _show(planned: Planned) -> None:
     console.print(f"[bold]experiment[/] {span}")
     if planned.parameters:
         console.print(_parameters(planned))
-    shown = Table("effect", "where", "smallest size that would be seen", "as", box=None, header_style="bold")
-    for v in planned.effects:
-        if v.reason is None:
-            name = v.parameter + (f", {v.unit}" if v.unit and v.unit != "1" else "")
-            shown.add_row(v.candidate.effect.name, v.candidate.place.where, f"{v.smallest:.3g}", name)
-    console.print(shown)
+    console.print(_effects(planned))
     for reason in sorted({v.reason for v in planned.effects if v.reason}):
         hidden = [v.candidate for v in planned.effects if v.reason == reason]
         console.print(
@@ -85,6 +80,24 @@ def _show(planned: Planned) -> None:
             f"better for the parameters: {planned.better.title} (last column of standard errors)",
             markup=False,
         )
+
+
+def _effects(planned: Planned) -> Table:
+    """Return the table of effects, first those that have to be largest before they would be seen."""
+    heads = ["effect", "where", "seen from", "which moves, before a refit"]
+    shown = Table(*heads, box=None, header_style="bold", title="seen, the worst first", title_justify="left")
+    seen = [v for v in planned.effects if v.reason is None]
+    for v in sorted(seen, key=lambda v: -(v.moves[2] if v.moves else 0.0)):
+        unit = f" {'K' if v.unit == 'degC' else v.unit}" if v.unit and v.unit != "1" else ""
+        moved = ""
+        if v.moves:
+            name, rms, share = v.moves
+            reading = planned.units.get(name) or ""
+            moved = f"{name} by {rms:.2g} {'K' if reading == 'degC' else reading}, {100 * share:.2g} % of its span"
+        shown.add_row(
+            v.candidate.effect.name, v.candidate.place.where, f"{v.parameter} = {v.smallest:.3g}{unit}", moved
+        )
+    return shown
 
 
 def _listed(texts: Iterable[str]) -> str:

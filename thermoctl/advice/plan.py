@@ -77,6 +77,7 @@ class Planned:
     parameters: list[Parameter]
     effects: list[Visible]
     better: Course | None
+    units: Mapping[str, str | None]  # by output
 
 
 def plan(
@@ -105,6 +106,7 @@ def plan(
         parameters(model, made),
         [*seen, *_at_rest(plant, effects, {v.candidate.key for v in seen})],
         better(plant, model, made, limits),
+        {o.name: o.unit for o in plant.outputs.values()},
     )
 
 
@@ -229,7 +231,12 @@ def contract(planned: Planned) -> dict[str, Any]:
         "interval_s": planned.interval_s,
         "slowest_time_constant_s": planned.slowest_s,
         "parameters": [dataclasses.asdict(p) for p in planned.parameters],
-        "visible": [v.entry() for v in planned.effects if v.reason is None],
+        "visible": [
+            v.entry()
+            | ({"moves": dict(zip(("output", "rms", "share"), v.moves, strict=True))} if v.moves else {})
+            for v in planned.effects
+            if v.reason is None
+        ],
         "hidden": [
             {"effect": v.candidate.effect.name, "where": v.candidate.place.where, "reason": v.reason}
             for v in planned.effects

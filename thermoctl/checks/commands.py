@@ -1,4 +1,4 @@
-"""The command `plant check`, and the checks that `diagnose` makes first."""
+"""The command `plant check`, and the checks that `diagnose`, `refit` and `simulate` make first."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TextIO
 
 from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
-from thermoctl.plant import Plant, load
+from thermoctl.plant import Plant, commands, load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.logger import options, print_notes
 from thermoctl.recording.table import Table
@@ -49,6 +49,39 @@ def checked(
     tables = read_recordings(plant, paths, **options(args))
     print_notes(tables)
     return tables, checks(plant, tables)
+
+
+def refit(args: argparse.Namespace) -> int:
+    """`thermoctl refit`: after the checks, which stop it where a number would take the shape of a mistake.
+
+    Raises InputError."""
+
+    def read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
+        """Read recordings; refuse those with a severe finding."""
+        tables, found = checked(plant, paths, args)
+        report(found, sys.stderr)
+        if any(f.severe for f in found) and not args.anyway:
+            raise InputError(
+                f"{plant.file}: not refitted: the checks above would make any number doubtful; correct the data or the "
+                "plant, or refit with --anyway"
+            )
+        return tables
+
+    return commands.refit(args, read)
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """`thermoctl simulate`: after the checks, which do not stop it: it names nothing."""
+
+    def read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
+        """Read recordings; check those in which an output was measured."""
+        tables = read_recordings(plant, paths, **options(args))
+        print_notes(tables)
+        outputs = [o.column for o in plant.outputs.values()]
+        report(checks(plant, [t for t in tables if any(c in t.columns for c in outputs)]), sys.stderr)
+        return tables
+
+    return commands.simulate(args, read)
 
 
 def report(found: Sequence[Finding], out: TextIO) -> None:

@@ -222,6 +222,14 @@ def _hypotheses(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
         if len(group) > 1:
             for what, forward in _corrections(group[0]):
                 yield _corrected(group, what, forward, first)
+    yield from swaps(plant, tables)
+
+
+def swaps(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
+    """Yield the pairs of columns that may be swapped: of one unit, of few columns any two."""
+    there = set.intersection(*(set(t.columns) for t in tables))
+    read: list[Input | Output] = [*driving_inputs(plant), *plant.outputs.values()]
+    items = list({i.column: i for i in read if i.column in there}.values())
     for a, b in combinations([i for i in items if all(moves(t, i.column) for t in tables)], 2):
         same = not (a.unit and b.unit) or dimension(a.unit) == dimension(b.unit)
         both_inputs = a.name in plant.inputs and b.name in plant.inputs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ from thermoctl.recording.logger import options, print_notes
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
+
+Reader = Callable[[Plant, Sequence[str], argparse.Namespace], list[Table]]
 
 
 def ends_of_tables(plant: Plant) -> dict[str, float]:
@@ -54,16 +56,16 @@ def _warn_of_tables(plant: Plant, recording: str, last: float) -> None:
             )
 
 
-def simulate(args: argparse.Namespace) -> int:
+def simulate(args: argparse.Namespace, read: Reader | None = None) -> int:
     """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
-    Prints figures; writes a file and a plot on request.
+    `read`: reads recordings. Prints figures; writes a file and a plot on request.
     """
     plant = load(args.plant, args.map)
     initial = _initial(plant, args)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
     model = compile_plant(all_uncertain(plant), ()) if args.horizon else compile_plant(plant)
-    for table in _read(plant, args.recordings, args):
+    for table in (read or _read)(plant, args.recordings, args):
         path = table.path
         excitation = model.excitation(table)
         if note := with_start(model, excitation, initial):
@@ -188,15 +190,17 @@ def _plot(
             raise InputError(f"{name}: cannot be written: {e}") from None
 
 
-def refit(args: argparse.Namespace) -> int:
-    """Refit a plant's parameters; write the plant; report estimates and the fit before and after."""
+def refit(args: argparse.Namespace, read: Reader | None = None) -> int:
+    """Refit a plant's parameters; write the plant; report estimates and the fit before and after.
+
+    `read`: reads recordings."""
     plant = load(args.plant, args.map)
     model = compile_plant(plant)
     if not any(p.range for p in plant.parameters.values()):
         raise InputError(f"{plant.file}: no parameter has a 'range', so there is nothing to refit")
-    trained = _read(plant, args.recordings, args)
+    trained = (read or _read)(plant, args.recordings, args)
     excitations = [model.excitation(t) for t in trained]
-    held = _read(plant, args.held_out or [], args)
+    held = (read or _read)(plant, args.held_out or [], args)
     try:
         found = fit(model, excitations, tries=args.tries)
         if args.noise == "ar1":

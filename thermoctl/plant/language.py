@@ -148,7 +148,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Plant:
-    """A checked plant."""
+    """A checked plant; `trusted`: its sensors are right, so that no fault of a reading is looked for."""
 
     title: str
     inputs: Mapping[str, Input]
@@ -157,6 +157,7 @@ class Plant:
     flows: Mapping[str, Flow]
     outputs: Mapping[str, Output]
     file: str = field(default="<plant>", compare=False)
+    trusted: bool = False
 
     def readings(self) -> tuple[Input | Output, ...]:
         """Return everything that has a column in a recording: inputs, then outputs."""
@@ -167,6 +168,7 @@ class Plant:
         content: dict[str, Any] = {
             "format": FORMAT,
             "title": self.title,
+            **({"sensors": "trusted"} if self.trusted else {}),
             "inputs": {i.name: _input(i) for i in self.inputs.values()},
             "parameters": {p.name: _parameter(p) for p in self.parameters.values()},
             "nodes": {n.name: _node(n) for n in self.nodes.values()},

@@ -47,6 +47,7 @@ def parse(root: YamlNode) -> Plant:
         raise title.error(f"title: text was expected, found {kind_of(title)}")
     if top.get("outputs", False) is None:
         raise root.error("no 'outputs': a plant without outputs cannot be compared with a recording")
+    trusted = top.text("sensors", "", ("trusted",)) == "trusted"
     items = _items(top)
     if not items["outputs"]:
         raise top.get("outputs").error(
@@ -62,6 +63,7 @@ def parse(root: YamlNode) -> Plant:
         {name: _flow(name, s, nodes) for name, s in items["flows"].items()},
         {name: _output(name, s) for name, s in items["outputs"].items()},
         root.file,
+        trusted,
     )
     _check_names(plant, items)
     _check_use(plant, items)

@@ -10,7 +10,7 @@ from typing import Any
 
 from thermoctl.diagnosis.hypothesis.builder import Builder, Placement
 from thermoctl.diagnosis.hypothesis.catalogue import Effect
-from thermoctl.diagnosis.hypothesis.places import PLACES, askable
+from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, askable
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -86,9 +86,13 @@ class Candidate(Placement):
 
 
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
-    """Every effect at every place it can sit, with every choice of the signals it needs."""
+    """Every effect at every place it can sit, with every choice of the signals it needs.
+
+    A plant with trusted sensors has no faults of readings."""
     out = []
     for effect in effects.values():
+        if rig.plant.trusted and effect.where in FAULTS:
+            continue
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
         for place in PLACES[effect.where](rig):

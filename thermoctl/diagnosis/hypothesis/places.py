@@ -273,6 +273,7 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 
 
 ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")  # places of errors of a reading
+FAULTS = (*ERRORS, "reading_in_air")  # which a plant with `sensors: trusted` has not
 PLACES = {
     "node": lambda rig: _nodes(rig, _storing(rig), "n"),
     "node_pair": _exchanging,

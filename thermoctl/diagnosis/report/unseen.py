@@ -8,8 +8,9 @@ own parameters absorb (screen.py). It depends on the plant, the inputs and the s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,13 +38,17 @@ TOO_LARGE = "its largest size would not show"
 
 @dataclass(frozen=True)
 class Visible:
-    """The smallest size of an effect at a place that would show; `reason`: why none would."""
+    """The smallest size of an effect at a place that would show; `reason`: why none would.
+
+    `moves`: the output that this size moves most beside its span, the rms of that before any refit, and its
+    share of the span."""
 
     candidate: Candidate
     parameter: str
     unit: str | None
     smallest: float
     reason: str | None = None
+    moves: tuple[str, float, float] | None = None
 
     def entry(self) -> dict[str, Any]:
         """Return it as the results' `not_seen` lists it."""
@@ -62,7 +67,7 @@ def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
     """Return by effect and place the smallest size that would have been seen, in the parameter's unit."""
     null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
     norms = [n for n in found.searched.norms if sized(n.column.item[0].effect)]
-    seen = _best(norms) if norms else visible(found.case, null, found.null.average)
+    seen = _best((n, None) for n in norms) if norms else visible(found.case, null, found.null.average)
     return [v.entry() for v in seen if v.reason is None]
 
 
@@ -78,29 +83,64 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     return _best(_norms(metric, at, columns))
 
 
+Rms = Mapping[str, tuple[float, float]]
+"""By output the rms change by a direction at s = 1, and the output's span."""
+
+
 def sized(effect: Effect) -> bool:
     """Return whether an effect has a size. A limit of a drive, a reading or a level has none."""
     return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
 
 
-def _best(norms: Iterable[Norms]) -> list[Visible]:
+def _best(norms: Iterable[tuple[Norms, Rms | None]]) -> list[Visible]:
     """Return the most visible size of each effect at each place."""
     best: dict[tuple[str, str], Visible] = {}
-    for n in norms:
+    for n, rms in norms:
         new = _visible(n.column, n.whole, n.left)
+        if rms and new.reason is None:
+            new = replace(new, moves=_moves(rms, _times(n.column, n.left)))
         old = best.get(new.candidate.key)
         if old is None or (new.reason is not None, new.smallest) < (old.reason is not None, old.smallest):
             best[new.candidate.key] = new
     return [best[key] for key in sorted(best)]
 
 
-def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterator[Norms]:
+def _moves(rms: Rms, times: float) -> tuple[str, float, float]:
+    name = max(rms, key=lambda o: rms[o][0] / rms[o][1])
+    return name, times * rms[name][0], times * rms[name][0] / rms[name][1]
+
+
+def _times(column: Column, left: float) -> float:
+    """Return the multiple of the direction at s = 1 that is the smallest visible size."""
+    sized_ = any(p.amplitude for p in column.item[0].effect.parameters)
+    return SEEN / left if sized_ else max(SEEN / left, 1 / NEAR)
+
+
+def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterator[tuple[Norms, Rms]]:
+    readings = np.concatenate([d.y for d in metric.drives])
+    names = metric.model.outputs
     for part, plain in directions(metric, at, columns):
         rows = plain * metric.weight[:, None]
         full = np.linalg.norm(rows, axis=0)
         left = np.linalg.norm(metric.project(rows), axis=0)
-        for column, whole, size in zip(part, full, left, strict=True):
-            yield Norms(column, float(whole), float(size))
+        energy = _energies(metric, plain)
+        for k, (column, whole, size) in enumerate(zip(part, full, left, strict=True)):
+            rms = {
+                names[j]: (float(e[k] / np.isfinite(readings[:, j]).sum()) ** 0.5, span)
+                for j, e in energy.items()
+                if (span := float(np.nanmax(readings[:, j]) - np.nanmin(readings[:, j]))) > 0
+            }
+            yield Norms(column, float(whole), float(size)), rms
+
+
+def _energies(metric: Rows, plain: np.ndarray) -> dict[int, np.ndarray]:
+    """Return by output the sum of squares of rows (rows, k), not whitened: (k,)."""
+    found: dict[int, np.ndarray] = {}
+    at = 0
+    for c in metric.plain.coordinates.channels:
+        found[c.output] = found.get(c.output, 0.0) + np.sum(plain[at : at + c.rows] ** 2, axis=0)
+        at += c.rows
+    return found
 
 
 def _visible(column: Column, full: float, left: float) -> Visible:
@@ -123,4 +163,6 @@ def _visible(column: Column, full: float, left: float) -> Visible:
 
 
 def _unit(c: Candidate, parameter: str) -> str | None:
-    return c.extend({}).parameters[c.own(parameter)].unit
+    """Return a parameter's unit for people: K/s, and not (K)/s."""
+    unit = c.extend({}).parameters[c.own(parameter)].unit
+    return re.sub(r"\(([^()*/ ]+)\)", r"\1", unit) if unit else unit
