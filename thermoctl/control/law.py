@@ -123,75 +123,17 @@ _O_ESTIMATES = len(OUTPUTS)
 _O_INNOVATION, _O_GAIN = OUTPUT["innovation_c"], OUTPUT["kalman_gain"]
 _O_POSITION_AGE, _O_COIL_AGE = OUTPUT["position_age_s"], OUTPUT["coil_age_s"]
 
-_SCALARS = (
-    "state",
-    "tick",
-    "latched",
-    "v",
-    "eps1",
-    "d1",
-    "setpoint_um",
-    "reference_um",
-    "position_um",
-    "compensated_um",
-    "compensation_um",
-    "expansion_um",
-    "power_w",
-    "air_c",
-    "air_start_c",
-    "air_known",
-    "air_rate_k_s",
-    "innovation_c",
-    "innovation_mean_c",
-    "kalman_gain",
-    "P",
-    "corrected",
-    "primed",
-    "expansion_before_um",
-    "expansion_after_um",
-    "phase_s",
-    "coil_slow_c",
-    "coil_rate_k_s",
-    "coil_elapsed_s",
-    "power_mean_w",
-    "following_s",
-    "idle_s",
-    "idle_readings",
-    "saturation_s",
-    "amplifier_s",
-    "average_at",
-    "averaged",
-    "enable",
-    "drive",
-    "air_started",
-    "resumed",
-    "model_error_c",
-    "ohm_v",
-    "ohm_scale_v",
-    "current_error_a",
-    "current_apart_a",
-    "drive_low",
-    "drive_high",
-    "drive_low_before",
-    "drive_high_before",
-    "displaced_um",
-    "position_apart_um",
-    "position_low_um",
-    "position_high_um",
-    "position_low_before_um",
-    "position_high_before_um",
-    "position_zero_um",
-    "zeroed",
-    "reference_error_um",
-    "reference_zero_um",
-    "reference_zeroed",
-    "exchanged",
-    "driving",
-    "ohm_w",
-    "ohm_a2",
-    "ohm_s",
-    "ohm_c",
-)
+_STATE = """
+state tick latched v eps1 d1 setpoint_um reference_um position_um compensated_um compensation_um expansion_um
+power_w air_c air_start_c air_known air_rate_k_s innovation_c innovation_mean_c kalman_gain P corrected primed
+expansion_before_um expansion_after_um phase_s coil_slow_c coil_rate_k_s coil_elapsed_s power_mean_w following_s
+idle_s idle_readings saturation_s amplifier_s average_at averaged enable drive air_started resumed model_error_c
+ohm_v ohm_scale_v current_error_a current_apart_a drive_low drive_high drive_low_before drive_high_before
+displaced_um position_apart_um position_low_um position_high_um position_low_before_um position_high_before_um
+position_zero_um zeroed reference_error_um reference_zero_um reference_zeroed exchanged driving ohm_w ohm_a2 ohm_s
+ohm_c
+"""
+_SCALARS = tuple(_STATE.split())
 _WHOLE = ("state", "tick", "latched", "average_at", "averaged")
 _VECTORS = (
     "x",
@@ -208,28 +150,11 @@ _VECTORS = (
     "corrections",
     "apart_c",
 )
-_KEPT = (
-    "air_c",
-    "air_start_c",
-    "air_known",
-    "air_started",
-    "corrected",
-    "primed",
-    "P",
-    "expansion_before_um",
-    "expansion_after_um",
-    "phase_s",
-    "compensation_um",
-    "expansion_um",
-    "position_zero_um",
-    "zeroed",
-    "reference_zero_um",
-    "reference_zeroed",
-    "x",
-    "T",
-    "T_before",
-    "corrections",
-)
+_RESUMED = """
+air_c air_start_c air_known air_started corrected primed P expansion_before_um expansion_after_um phase_s
+compensation_um expansion_um position_zero_um zeroed reference_zero_um reference_zeroed x T T_before corrections
+"""
+_KEPT = tuple(_RESUMED.split())
 
 
 def finite(value):
@@ -307,28 +232,10 @@ class Law:
         )
 
     def _zero(self):
-        """Set the scalars to those of a new law."""
-        self.state, self.latched, self.tick, self.average_at, self.averaged = arming.OFF, 0, 0, 0, 0
-        self.v = self.eps1 = self.d1 = 0.0
-        self.setpoint_um = self.reference_um = self.position_um = self.compensated_um = 0.0
-        self.power_w = self.power_mean_w = self.air_c = self.air_start_c = self.air_known = (
-            self.air_rate_k_s
-        ) = 0.0
-        self.corrected = self.coil_slow_c = self.coil_rate_k_s = self.coil_elapsed_s = 0.0
-        self.innovation_c = self.innovation_mean_c = self.kalman_gain = 0.0
-        self.P = 1e3 * self.R_v
-        self.primed = self.phase_s = self.expansion_before_um = self.expansion_after_um = 0.0
-        self.expansion_um = self.compensation_um = 0.0
-        self.air_started = self.resumed = self.model_error_c = 0.0
-        self.ohm_v = self.ohm_scale_v = self.current_error_a = self.current_apart_a = 0.0
-        self.drive_low = self.drive_high = self.drive_low_before = self.drive_high_before = 0.0
-        self.displaced_um = self.position_apart_um = self.position_zero_um = self.zeroed = 0.0
-        self.position_low_um = self.position_high_um = 0.0
-        self.position_low_before_um = self.position_high_before_um = self.reference_error_um = 0.0
-        self.reference_zero_um = self.reference_zeroed = self.exchanged = 0.0
-        self.ohm_w = self.ohm_a2 = self.ohm_s = self.ohm_c = 0.0
-        self.following_s = self.idle_s = self.idle_readings = self.saturation_s = 0.0
-        self.amplifier_s = self.driving = self.enable = self.drive = self.control_v = 0.0
+        """Set the scalars of the state to those of a new law."""
+        for name in _SCALARS:
+            setattr(self, name, 0 if name in _WHOLE else 0.0)
+        self.state, self.P, self.control_v = arming.OFF, 1e3 * self.R_v, 0.0
 
     def bind(self, value, fresh, status, delay=None):
         """Take the arrays over the channels that hold the readings of each tick.
