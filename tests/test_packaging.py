@@ -1,5 +1,6 @@
 """The package's description: every dependency with its licence in install.md, as the package itself states it."""
 
+import importlib
 import importlib.metadata
 import re
 import tomllib
@@ -60,3 +61,10 @@ def test_the_licence_is_the_one_that_the_package_states(name):
 def test_the_description_says_whose_and_for_which_python():
     assert PROJECT["authors"] and PROJECT["keywords"]
     assert {f"Programming Language :: Python :: 3.{k}" for k in (11, 12, 13)} <= set(PROJECT["classifiers"])
+
+
+def test_the_version_stands_in_one_place_and_heads_the_changelog():
+    version = importlib.import_module("thermoctl").__version__
+    assert "version" in PROJECT["dynamic"] and "version" not in PROJECT
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest and newest[1] == version

@@ -18,8 +18,6 @@ from thermoctl_hal.base.backend import ERROR, STALE, Sample
 from thermoctl_hal.base.binding import NO_VALUE, Binding
 from thermoctl_hal.base.wire import Channels
 
-SLOW_BUSES = ("modbus",)
-
 
 class Device:
     """Bound channels, the check of each reading, counters.
@@ -30,7 +28,7 @@ class Device:
     def __init__(self, binding: Binding) -> None:
         self.binding = binding
         self.name = binding.name
-        self.slow = binding.profile.bus in SLOW_BUSES
+        self.slow = False
         self.drives = binding.profile.amplifier is not None
         self.roles = [binding.channels.index[b.role] for b in binding.bounds]
         columns = zip(*((b.scale, b.offset, b.low, b.high) for b in binding.bounds), strict=True)

@@ -116,6 +116,7 @@ class ModbusDevice(Device):
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)
+        self.slow = True  # an answer takes milliseconds, a lost one the timeout
         self.counts["lost"] = 0
         self._link: Link | None = None
         self._spec = typed(binding.profile.bus_spec, Modbus)
