@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.export.plants import DELAYED, FRICTION, plants, recording
+from tests.export.plants import FRICTION, plants, recording
 from thermoctl import cli
 from thermoctl.export.commands import write
 from thermoctl.plant import expression as ex
@@ -233,11 +233,9 @@ def test_a_plant_that_needs_a_recording_says_so(tmp_path):
         InputError, match=r"reads first\(position\), an output: give a recording \(--data REC\)"
     ):
         write(loads(FRICTION), "c", tmp_path / "plant.c")
-    with pytest.raises(InputError, match="has no delay.*--to fmu"):
-        write(loads(DELAYED), "simulink-m", tmp_path / "plant.m")
 
 
-@pytest.mark.parametrize("to", ["fmu", "modelica", "python", "c", "simulink-m"])
+@pytest.mark.parametrize("to", ["fmu", "modelica", "python", "c"])
 def test_the_command(to, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     plant, dt = ALL["extended"]

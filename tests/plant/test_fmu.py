@@ -52,15 +52,15 @@ def heater(tmp_path_factory):
     return plant, as_fmu(plant, table, tmp_path_factory.mktemp("fmu")), table
 
 
-def as_cosimulation(fmu: Path, path: Path, mapped: str = "") -> Plant:
-    """Load the FMU without its part of model exchange, with a map of inputs, outputs and parameters."""
+def without_exchange(fmu: Path, path: Path, instead: bytes = b"") -> Path:
+    """Copy an FMU without its part of model exchange."""
     with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(path, "w") as new:
         for item in old.infolist():
             new.writestr(
-                item, EXCHANGE.sub(b"", old.read(item)) if item.filename[-4:] == ".xml" else old.read(item)
+                item,
+                EXCHANGE.sub(instead, old.read(item)) if item.filename[-4:] == ".xml" else old.read(item),
             )
-    path.with_suffix(".yaml").write_text(mapped or "{}")
-    return load(path, path.with_suffix(".yaml"))
+    return path
 
 
 def block(folder: Path, exact: bool = True, *options: str) -> Path:
@@ -79,7 +79,7 @@ SWITCHES = """<ScalarVariable name="on" valueReference="0" causality="input" var
   </ModelVariables>"""
 
 
-def switched(folder: Path, name: str, interface: str, content: str = "binaries/linux64/block.so") -> Path:
+def switched(folder: Path, name: str, content: str = "binaries/linux64/block.so") -> Path:
     """The FMU of fmu2_block.c with a Boolean and an integer input; `content`: its library or its source."""
     path, made, source = folder / name, folder / "block.so", Path(__file__).with_name("fmu2_block.c")
     subprocess.run(["cc", "-w", "-shared", "-fPIC", "-o", made, source], check=True)
@@ -87,7 +87,9 @@ def switched(folder: Path, name: str, interface: str, content: str = "binaries/l
     with zipfile.ZipFile(path, "w") as fmu:
         fmu.writestr(
             "modelDescription.xml",
-            EXCHANGE.sub(interface.encode(), text.encode()).replace(b"</ModelVariables>", SWITCHES.encode()),
+            EXCHANGE.sub(b"<ModelExchange modelIdentifier='block'/>", text.encode()).replace(
+                b"</ModelVariables>", SWITCHES.encode()
+            ),
         )
         fmu.write(source if content.startswith("sources") else made, content)
     return path
@@ -106,39 +108,20 @@ def switched_run(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
     return theirs, np.array(warm) + 0.01 * 4
 
 
-@pytest.mark.parametrize(
-    "interface", ["<ModelExchange modelIdentifier='block'/>", "<CoSimulation modelIdentifier='block'/>"]
-)
-def test_boolean_and_integer_inputs_are_driven(tmp_path, interface):
-    theirs, ours = switched_run(load(switched(tmp_path, "b.FMU", interface)))
+def test_boolean_and_integer_inputs_are_driven(tmp_path):
+    theirs, ours = switched_run(load(switched(tmp_path, "b.FMU")))
     assert np.max(np.abs(theirs - ours)) < 2e-3 < 0.1 * np.ptp(ours)
 
 
 def test_an_fmu_of_sources_is_compiled(tmp_path):
-    path = switched(tmp_path, "s.fmu", "<ModelExchange modelIdentifier='block'/>", "sources/block.c")
+    path = switched(tmp_path, "s.fmu", "sources/block.c")
     theirs, ours = switched_run(load(path))
     assert np.max(np.abs(theirs - ours)) < 2e-3
-    other = switched(
-        tmp_path, "w.fmu", "<ModelExchange modelIdentifier='block'/>", "binaries/win64/block.dll"
-    )
+    other = switched(tmp_path, "w.fmu", "binaries/win64/block.dll")
     with pytest.raises(
         InputError, match=r"w.fmu: no library for this machine \(.*it has win64\) and no C sources"
     ):
         load(other)
-
-
-def test_a_refused_step_is_named_with_its_time(tmp_path, capsys):
-    fixed = '<CoSimulation modelIdentifier="block" canHandleVariableCommunicationStepSize="false"/>'
-    path = switched(tmp_path, "c.fmu", fixed)
-    rows = "\n".join(
-        f"{t},{101 if t >= 20 else 5},22,1,1,25" for t in range(0, 60, 2)
-    )  # it refuses above 100 W
-    (tmp_path / "r.csv").write_text(f"t,heater.P,air,on,stage,reading\n{rows}\n")
-    assert cli.main(["simulate", "--plant", str(path), str(tmp_path / "r.csv")]) == 2
-    error = capsys.readouterr().err
-    assert (
-        "c.fmu refuses the step from t = " in error and " s of 2 s: it takes steps of one size only" in error
-    )
 
 
 def test_the_same_outputs_and_sensitivities(heater):
@@ -255,8 +238,12 @@ def test_what_is_no_usable_fmu_is_said(heater, tmp_path):
     with pytest.raises(InputError, match="goes with an FMU"):
         load(HEATER / "plant.yaml", tmp_path / "map.yaml")
     path = block(tmp_path)
-    with pytest.raises(InputError, match="of model exchange or of co-simulation was expected"):
-        as_cosimulation(path, tmp_path / "neither.fmu")
+    for instead, words in (
+        (b"", "was expected; export"),
+        (b"<CoSimulation modelIdentifier='block'/>", "found one of co-simulation only"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load(without_exchange(path, tmp_path / "other.fmu", instead))
     with pytest.raises(InputError, match="no state, input or parameter 'Q'"):
         opened(str(path)).argument("Q")
     with pytest.raises(InputError, match="no derivative and no output 'T'"):
@@ -282,26 +269,6 @@ class Block(Fmi3Slave, ModelExchange):
         return [self.slope]
 '''  # fmt: skip
 
-STEPPED = '''
-import math
-from pythonfmu3 import Fmi3Causality as Is, Fmi3Slave, Fmi3Variability as Changes, Float64
-
-class Stepped(Fmi3Slave):
-    def __init__(self, **given):
-        super().__init__(**given)
-        self.time, self.T, self.power, self.C = 0.0, 22.0, 0.0, 100.0
-        always = {"variability": Changes.continuous}
-        self.register_variable(Float64("time", causality=Is.independent, **always))
-        self.register_variable(Float64("power", causality=Is.input, start=0.0, **always))
-        self.register_variable(Float64("C", causality=Is.parameter, variability=Changes.tunable, start=100.0))
-        self.register_variable(Float64("T", causality=Is.output, **always))
-
-    def do_step(self, current_time, step_size):
-        end = 22 + self.power / 0.2
-        self.T = end + (self.T - end) * math.exp(-0.2 / self.C * step_size)
-        return True
-'''  # fmt: skip
-
 
 def test_an_fmu_of_fmi_3_by_pythonfmu3(tmp_path):
     """The output is the state itself; the plant gives it another name."""
@@ -317,66 +284,3 @@ def test_an_fmu_of_fmi_3_by_pythonfmu3(tmp_path):
     heated = 20 * (1 - np.exp(-0.2 / 100 * t))
     assert run.y[:, 0] == pytest.approx(22 + heated, abs=1e-4)
     assert run.dy[:, 0, 0] == pytest.approx(-4 * t / 100**2 * np.exp(-0.2 / 100 * t), abs=1e-5)
-
-
-def test_a_run_of_cosimulation_is_that_of_model_exchange(heater, tmp_path):
-    """Values, slopes by parameters, and slopes by a drift of an input, whose history counts."""
-    plant, back, table = heater
-    fmu = Path(str(next(iter(back.flows.values())).rate).split('"')[1])
-    closed = as_cosimulation(fmu, tmp_path / "closed.fmu", "inputs: {air: {column: air_temperature}}")
-    assert not closed.nodes and "hold(heat)" in str(closed.outputs["temperature_1"].value)
-    short = Table("short", "short.csv", table.t[:300], {k: v[:300] for k, v in table.columns.items()})
-    runs, unknowns = [], []
-    for p in (back, closed):
-        rig = Structure(p, [compile_plant(p).excitation(short)], [short.columns])
-        found = {c.key: c for c in candidates(rig, catalogue())}
-        assert ("external_heat_source", "two") in found or not p.nodes
-        longer = found["sensor_drift", "air"].extend({"A": 0.01})
-        model = compile_plant(longer, tuple(longer.parameters))
-        runs.append(model.simulate(short, sensitivities=True))
-        unknowns.append(model.unknowns)
-    ours, theirs = runs
-    assert np.max(np.abs(ours.y - theirs.y)) < 1e-6 * np.ptp(ours.y)
-    for k, q in enumerate(unknowns[1]):
-        slope = ours.dy[:, :, unknowns[0].index(q)]
-        assert np.max(np.abs(theirs.dy[:, :, k] - slope)) < 1e-3 * np.max(np.abs(slope)), q
-    assert any("drift" in q for q in unknowns[1])
-    with pytest.raises(InputError, match=r"no state 'one'"):
-        as_cosimulation(fmu, tmp_path / "again.fmu", "states: {one: {}}")
-
-
-def test_what_cannot_be_asked_of_cosimulation_is_one_line(heater, tmp_path, capsys):
-    _, back, _ = heater
-    fmu = Path(str(next(iter(back.flows.values())).rate).split('"')[1])
-    as_cosimulation(fmu, tmp_path / "closed.fmu")
-    assert cli.main(["plant", "check", str(tmp_path / "closed.fmu")]) == 0
-    (line,) = [text for text in capsys.readouterr().out.splitlines() if "co-simulation" in text]
-    assert "effects at inputs and outputs can be named, none inside" in line
-
-
-def test_a_refit_of_cosimulation_by_pythonfmu3(tmp_path):
-    builder = pytest.importorskip("pythonfmu3.builder")
-    (tmp_path / "stepped.py").write_text(STEPPED)
-    builder.FmuBuilder.build_FMU(tmp_path / "stepped.py", dest=tmp_path)
-    mapped = tmp_path / "map.yaml"
-    mapped.write_text(
-        "inputs: {power: {between_samples: hold}}\noutputs: {T: {noise: 0.01}}\nparameters: {C: {range: [50, 200]}}"
-    )
-    t = np.arange(0.0, 100.0, 2.0)
-    power = np.where(t < 50, 4.0, 1.0)
-    heated = np.array([np.exp(-0.2 / 80 * np.maximum(t - s, 0)) for s in (0, 50)])
-    T = 22 + 20 * (1 - heated[0]) - 15 * (1 - heated[1])
-    found = tc.refit(tc.load_plant(tmp_path / "Stepped.fmu", map=mapped), {"t": t, "power": power, "T": T})
-    assert found.plant.parameters["C"] == pytest.approx(80, rel=1e-4)
-
-
-def test_a_run_that_fails_is_no_number_until_it_begins_anew(tmp_path):
-    """A strict FMU of C that refuses a power above 100."""
-    with zipfile.ZipFile(block(tmp_path)) as old, zipfile.ZipFile(tmp_path / "cs.fmu", "w") as new:
-        for item in old.infolist():
-            new.writestr(item, old.read(item).replace(b"ModelExchange", b"CoSimulation"))
-    fmu = opened(str(tmp_path / "cs.fmu"))
-    t, names = np.arange(4.0), ("hold(heater.P)",)
-    assert np.isfinite(fmu.evaluate("reading", names, [t, np.array([0.0, 5, 5, 5])])).all()
-    y = fmu.evaluate("reading", names, [t, np.array([0.0, 500, 5, 5])])
-    assert np.isfinite(y[0]) and np.isnan(y[2:]).all()

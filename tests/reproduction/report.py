@@ -11,6 +11,7 @@ from tests.reproduction import rigs, tables
 from tests.reproduction.figures import figures
 from tests.reproduction.goals import Goal, Limit
 from tests.reproduction.seeds import Kept, MeanTwoS, SeedResult
+from tests.reproduction.sensors import choose_sensors
 from thermoctl.calibration import chain
 from thermoctl.identify import filter
 from thermoctl.report.page import page, table
@@ -179,7 +180,7 @@ def _temperatures(kept: Kept) -> Section:
 def _sensors(c: chain.Calibration) -> Section:
     gains = (c.better_um.b1 + c.better_um.b2) / (1 - c.better_um.f1)
     r_v = filter.sensor_variance(chain.STEP_K, chain.NOISE_K)
-    choice = filter.choose_sensors(c.kalman.model, c.variances, r_v, gains, 12)
+    choice = choose_sensors(c.kalman.model, c.variances, r_v, gains, 12)
     rows = [[", ".join(POINTS[j].replace("_", " ") for j in s), len(s), e] for s, e in choice]
     caption = "by the filter's own covariance with the calibrated noise, unmeasured heat at its usual size"
     return (

@@ -41,7 +41,7 @@ class Plant:
         save(self.description, path)
 
     def export(self, path: str | Path, data: Data | None = None) -> None:
-        """Write the plant for another program: the suffix says which (.fmu, .mo, .py, .c, .m).
+        """Write the plant for another program: the suffix says which (.fmu, .mo, .py, .c).
 
         `data`: a recording, where a jump or an initial value needs one. Raises InputError."""
         kinds = {suffix: to for to, suffix in SUFFIX.items()}

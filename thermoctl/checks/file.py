@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermoctl.checks.finding import Finding
-from thermoctl.checks.model import closed_findings, jacobian, unit_findings
+from thermoctl.checks.model import jacobian, unit_findings
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -20,13 +20,7 @@ HOMOGENEOUS = 1e-9  # relative error of Euler's theorem
 
 def file_findings(plant: Plant) -> list[Finding]:
     """Return warnings of a plant file; no recording is needed."""
-    return [
-        *unit_findings(plant),
-        *closed_findings(plant),
-        *_storages(plant),
-        *_signs(plant),
-        *_scales(plant),
-    ]
+    return [*unit_findings(plant), *_storages(plant), *_signs(plant), *_scales(plant)]
 
 
 def _values(plant: Plant, seed: int = 0) -> dict[str, float]:

@@ -12,7 +12,6 @@ import numpy as np
 from thermoctl.checks.finding import Finding
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
-from thermoctl.plant.fmu import opened
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.plant.whitening import default_noise
 
@@ -23,7 +22,7 @@ SIGMAS = 6.0  # two-sided false alarm of 2e-9 a sample for normal errors
 
 def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Finding]:
     """Check units, storages, stability and time constants."""
-    found = [*unit_findings(model.plant), *closed_findings(model.plant)]
+    found = unit_findings(model.plant)
     for excitation in excitations:
         found += _storages(model, excitation)
         if found and found[-1].kind == "storage":
@@ -43,23 +42,6 @@ def unit_findings(plant: Plant) -> list[Finding]:
     what = "no quantity has a unit, so no expression could be checked"
     todo = "Give inputs, parameters, nodes and outputs their units."
     return [Finding("no units", plant.file, what, todo, severe=False)]
-
-
-def closed_findings(plant: Plant) -> list[Finding]:
-    """Return a warning where an FMU of co-simulation computes outputs: no effect inside it can be named."""
-    closed = [
-        o.name
-        for o in plant.outputs.values()
-        if any(e.op == "fmu" and opened(e.value[0]).runs for e in ex.walk(o.value))
-    ]
-    if not closed:
-        return []
-    what = (
-        f"an FMU of co-simulation computes {', '.join(closed)} from states of its own: effects at inputs and outputs "
-        "can be named, none inside it"
-    )
-    todo = "Export it for model exchange where the tool can."
-    return [Finding("co-simulation", plant.file, what, todo, severe=False)]
 
 
 def _once(found: list[Finding]) -> list[Finding]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from thermoctl.export.c import c_source
 from thermoctl.export.fmu import write_fmu
-from thermoctl.export.matlab import matlab_source
 from thermoctl.export.modelica import modelica_source
 from thermoctl.export.python import python_source
 from thermoctl.export.values import values
@@ -22,7 +21,7 @@ from thermoctl.recording.table import Table
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
-SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c", "simulink-m": ".m"}
+SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c"}
 
 
 def export(args: argparse.Namespace) -> int:
@@ -59,14 +58,9 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             start[i.name] = float(column[np.isfinite(column)][0])
         write_fmu(plant, numbers, out, start)
         return
-    if to == "simulink-m" and name != out.stem:
-        raise InputError(
-            f"{out}: the file is called as its function: a name of letters, digits and '_' was expected"
-        )
     text = {
         "modelica": lambda: modelica_source(plant, numbers, name),
         "python": lambda: python_source(plant, numbers),
         "c": lambda: c_source(plant, numbers),
-        "simulink-m": lambda: matlab_source(plant, numbers, name),
     }[to]()
     write_text(out, text)

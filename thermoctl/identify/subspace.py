@@ -29,9 +29,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
-from thermoctl.identify import kernels, modal
+from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, _c, _ridge
-from thermoctl.identify.statespace import modal as modal_form
 from thermoctl.yamlfile import InputError
 
 WEIGHTINGS = ("paper", "n4sid", "moesp", "cva")
@@ -354,28 +353,6 @@ def paper_b(sub: Subspace, a: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
     return linalg.lstsq(matrix, target.ravel())[0].reshape(n, m)
 
 
-def real_poles(model: StateSpace, u: np.ndarray, y: np.ndarray, rest: bool = True) -> StateSpace:
-    """Return the model with every pole moved to the nearest real value between 0 and 1.
-
-    A heat network admits no others. The residues are fitted again by least squares. The result starts the
-    refinement in `modal`."""
-    tau = np.sort(model.time_constants_s[np.abs(model.poles) > 1e-3])
-    tau = np.clip(tau, model.period_s, 2.5 * len(u) * model.period_s)
-    blocks = modal.reduce((u, y), model.period_s, model.period_s)
-    fit = modal._fit([blocks], blocks.y, np.ones(len(blocks.y)), tau, rest, 0, (0.5 * tau[0], 3 * tau[-1]))
-    m = blocks.u.shape[1]
-    p = np.exp(-model.period_s / fit.tau)
-    theta = fit.theta.reshape(len(tau), m + (not rest), -1)
-    free = np.zeros((len(tau), theta.shape[2])) if rest else theta[:, m]
-    return modal_form(
-        p,
-        np.moveaxis(theta[:, :m], 1, 2) * (1 - p)[:, None, None],
-        free,
-        model.period_s,
-        {**model.info, "real_poles": True},
-    )
-
-
 def innovations(model: StateSpace, u: np.ndarray, y: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return one-step prediction errors (N, l) of (6), with K = `gain` (n, l).
 
@@ -409,7 +386,7 @@ def refine_prediction_error(
 ) -> tuple[StateSpace, np.ndarray]:
     """Refine C, B, K and the (real) poles by prediction errors (Gauss-Newton); return (model, K (n, l)).
 
-    The model must be diagonal (from `modal` or `real_poles`). Minimises the whitened innovations' sum of
+    The model must be diagonal (from `modal`). Minimises the whitened innovations' sum of
     squares; a step that would leave the stable region or raise the cost is halved. Returns the start
     unchanged if nothing improves.
     """

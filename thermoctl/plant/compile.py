@@ -123,8 +123,7 @@ class Code(Equations):
         contents = "".join(f"/* {opened(path).digest} */\n" for path in self.fmus)
         return [
             f"{contents}double (*fmu_value_)(void *, int, const double *), "
-            f"(*fmu_slope_)(void *, int, int, const double *), "
-            f"(*fmu_steps_)(void *, int, int, const double *, const double *);\nvoid *fmus_[{len(self.fmus)}];\n"
+            f"(*fmu_slope_)(void *, int, int, const double *);\nvoid *fmus_[{len(self.fmus)}];\n"
         ]
 
 

@@ -51,7 +51,6 @@ class Equations:
         self.slopes = [div(net[n.name], n.storage) for n in plant.nodes.values()]
         self._widths()
         self.fmus = used(e for root in self._roots() for e in ex.walk(root))
-        self._courses: dict[tuple[Expr, ...], int] = {}
 
     def _take_out_delays(self) -> None:
         """Replace delays by names: of derived inputs in rates, of delayed values in outputs."""
@@ -194,16 +193,10 @@ class Equations:
         fmu = opened(path)
         number, at = self.fmus.index(path), [0, *map(fmu.argument, names)]
 
-        def row(given: list[str], missing: str) -> str:
-            """Return a C array of the FMU's arguments: `given` at their places, else `missing`."""
-            known = dict(zip(at, given, strict=True))
-            return f"(const double[]){{{', '.join(known.get(j, missing) for j in range(1 + len(fmu.arguments)))}}}"
-
-        values = row(a[: len(at)], "NAN")
-        if fmu.runs:
-            course = self._courses.setdefault(e.args, len(self._courses))
-            change = row(["0.0", *a[len(at) :]], "0.0") if e.op == "fmu_change" else "0"
-            return f"fmu_steps_(fmus_[{number}], {course}, {fmu.result(result)}, {values}, {change})"
+        known = dict(zip(at, a, strict=True))
+        values = (
+            f"(const double[]){{{', '.join(known.get(j, 'NAN') for j in range(1 + len(fmu.arguments)))}}}"
+        )
         places = ", ".join(str(k) for k in (fmu.result(result), *map(fmu.argument, by)))
         function = "fmu_slope_" if by else "fmu_value_"
         return f"{function}(fmus_[{number}], {places}, {values})"

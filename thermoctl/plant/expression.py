@@ -63,7 +63,6 @@ class Expr:
     - 'delay': args are an expression and seconds; 'first': value is a name;
     - 'fmu': args are time and the values given; value is the file, its result, and the names of the values
     - only in derivatives: 'fmu_slope', an 'fmu' whose value ends in the name that it is differentiated by
-    - only in derivatives: 'fmu_change', an 'fmu' of co-simulation; args: those of it, then the values' slopes
     - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
       step);
     - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).
@@ -548,9 +547,6 @@ def _derive(e: Expr, by: str, done: Mapping[int, Expr]) -> Expr:
             return mul(make("bump", add(a[1], neg(a[0]))), add(d[1], neg(d[0])))
         case "==" | "!=" | "le" | "side" | "bump" | "dpow":
             return ZERO
-        case "fmu" if opened(e.value[0]).runs:
-            changes = any(change is not ZERO for change in d[1:])
-            return make("fmu_change", *a, *d[1:], value=e.value) if changes else ZERO
         case "fmu":  # time is not among the unknowns
             total = ZERO
             for n, change in zip(e.value[2], d[1:], strict=True):
@@ -649,7 +645,7 @@ def _value(
     if op == "dpow":
         base = np.maximum(a[0], 1e-8)
         return np.where(np.asarray(a[0]) > 0, np.power(base, a[1] - 1.0), 0.0)
-    if op in ("fmu", "fmu_slope", "fmu_change"):
+    if op in ("fmu", "fmu_slope"):
         path, result, given, *by = e.value
         return opened(path).evaluate(result, given, a, *by)
     if op in ("table", "table_slope"):

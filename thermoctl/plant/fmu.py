@@ -6,9 +6,6 @@ is the derivative that the FMU computes with its variables T and heater.P at the
 output gives that output. Time is passed on. Other variables keep the FMU's start values.
 Slopes are directional derivatives where the FMU gives them, else central differences (fmu.h).
 
-An FMU of co-simulation only has neither states nor derivatives. Its output is that of a run from the first
-sample on (cosimulation.py). There "hold(u)" instead of "u" is an input held between samples.
-
 An FMU is a program: opening one runs it.
 """
 
@@ -20,7 +17,6 @@ import hashlib
 import shutil
 import subprocess
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -31,7 +27,6 @@ import numpy as np
 
 from thermoctl.extras import load
 from thermoctl.plant.build import compiler, library
-from thermoctl.plant.cosimulation import Course, Layout, References
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
@@ -71,9 +66,6 @@ class Fmu:
     """An opened FMU of model exchange: its variables by kind, and its results as functions.
 
     `depends`: the states and inputs that a result (a state's derivative, an output) depends on."""
-
-    runs = False
-    """Whether a result belongs to a run from the first sample on, not to one row of arguments."""
 
     def __init__(self, path: Path, d: ModelDescription):
         self.path = path
@@ -203,124 +195,6 @@ class Fmu:
         return self.results[name]
 
 
-_STEPS = ctypes.CFUNCTYPE(
-    ctypes.c_double,
-    ctypes.c_void_p,
-    ctypes.c_int,
-    ctypes.c_int,
-    ctypes.POINTER(ctypes.c_double),
-    ctypes.POINTER(ctypes.c_double),
-)
-_OPENED: dict[int, Cosimulation] = {}
-
-
-def _advance(number: int, course: int, k: int, row: Any, change: Any) -> float:
-    """Return result k of an FMU's course at a row, or its slope: called by a plant's machine code."""
-    fmu = _OPENED[number]
-    size = 1 + len(fmu.arguments)
-    key = threading.get_ident(), course, bool(change)
-    if (runs := fmu.courses.get(key)) is None:
-        runs = fmu.courses[key] = fmu.course()
-    a = np.frombuffer(ctypes.string_at(row, 8 * size))
-    if not change:
-        return float(runs.value(a)[k])
-    return float(runs.slope(a, np.frombuffer(ctypes.string_at(change, 8 * size)))[k])
-
-
-_steps = _STEPS(_advance)
-
-
-class Cosimulation(Fmu):
-    """An opened FMU that is for co-simulation only: no states, and outputs of runs."""
-
-    runs = True
-    refusal = ""
-    """The first step that the FMU refused, for people."""
-
-    def __init__(self, path: Path, d: ModelDescription):
-        self.path = path
-        self.digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        self._description, self._folder = d, _extracted(path, d)
-        variables = [v for v in d.modelVariables if v.type in ("Real", "Float64") and not v.dimensions]
-        inputs = _inputs(d)
-        parameters = [v for v in variables if v.causality == "parameter" and v.variability != "constant"]
-        unknowns = [u for u in d.outputs if u.variable in variables]
-        settable = [*inputs, *parameters]
-        self._instance = self._made()
-        try:
-            if self._version == 2:
-                self._instance.setupExperiment(startTime=0.0)
-            self._instance.enterInitializationMode()
-            self._instance.exitInitializationMode()
-            now = self._values(settable)
-        except Exception as e:
-            raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
-        self._layout = Layout(
-            self._version,
-            _references(inputs),
-            _references(parameters),
-            _references([u.variable for u in unknowns]),
-            np.array([now[v.name] for v in settable]),
-            np.array([float(getattr(v, "nominal", 0) or 0) or _size(now[v.name]) for v in settable]),
-            tuple(v.type for v in inputs),
-            self._refused,
-        )
-        self.inputs, self.parameters = (
-            {v.name: _variable(v, now) for v in group} for group in (inputs, parameters)
-        )
-        self.states, self.derivatives = {}, {}
-        self.outputs = {u.variable.name: _variable(u.variable, {}) for u in unknowns}
-        names = [*self.inputs, *(f"hold({n})" for n in self.inputs), *self.parameters]
-        self.arguments = {n: 1 + j for j, n in enumerate(names)}
-        self.results = {o: k for k, o in enumerate(self.outputs)}
-        self.depends = dict.fromkeys(self.outputs, set(self.inputs))
-        self.courses: dict[tuple[int, int, bool], Course] = {}
-        _OPENED[id(self)] = self
-
-    def _made(self) -> Any:
-        return _instantiated(self.path, self._description, self._folder)
-
-    def _refused(self, t: float, seconds: float) -> None:
-        """Keep the first step that the FMU refuses, and what to do about it."""
-        if self.refusal:
-            return
-        self.refusal = f"{self.path.name} refuses the step from t = {t:g} s of {seconds:g} s"
-        only = self._description.coSimulation
-        if only is not None and not only.canHandleVariableCommunicationStepSize:
-            own = getattr(only, "fixedInternalStepSize", None) or getattr(
-                self._description.defaultExperiment, "stepSize", None
-            )
-            self.refusal += (
-                f": it takes steps of one size only ({f'{float(own):g} s' if own else 'which its description does not say'}); "
-                "resample the recording to it, or export the FMU for model exchange"
-            )
-
-    def course(self) -> Course:
-        """Return a new course."""
-        return Course(self._layout, self._made)
-
-    def link(self, library: ctypes.CDLL, index: int) -> None:
-        """Give a plant's machine code this FMU under its number."""
-        ctypes.c_void_p.in_dll(library, "fmu_steps_").value = ctypes.cast(_steps, ctypes.c_void_p).value
-        (ctypes.c_void_p * (index + 1)).in_dll(library, "fmus_")[index] = id(self)
-
-    def evaluate(
-        self, result: str, names: Sequence[str], values: Sequence[Any], by: str | None = None
-    ) -> Any:
-        """Return an output over rows of time and arguments, in order; [0]: time.
-
-        With as many values again, without a time, its slope where these are the arguments' slopes."""
-        shaped = np.broadcast_arrays(*(np.asarray(v, float) for v in values))
-        count, course, k = 1 + len(names), self.course(), self.result(result)
-        rows = self._rows(names, shaped[:count], np.nan)
-        if len(shaped) == count:
-            out = [course.value(row)[k] for row in rows]
-        else:
-            changes = self._rows(names, [np.zeros_like(shaped[0]), *shaped[count:]], 0.0)
-            out = [course.slope(row, change)[k] for row, change in zip(rows, changes, strict=True)]
-        return np.array(out).reshape(shaped[0].shape)[()]
-
-
 def _inputs(d: ModelDescription) -> list[ModelVariable]:
     """Return the inputs that a recording can drive: real, Boolean and integer scalars."""
     return [v for v in d.modelVariables if v.causality == "input" and v.type in _TYPES and not v.dimensions]
@@ -328,10 +202,6 @@ def _inputs(d: ModelDescription) -> list[ModelVariable]:
 
 def _discrete(v: ModelVariable) -> bool:
     return v.variability == "discrete" or _TYPES[v.type][0] > 0
-
-
-def _references(variables: Sequence[ModelVariable]) -> References:
-    return (ctypes.c_uint * len(variables))(*(v.valueReference for v in variables))
 
 
 def _variable(v: ModelVariable, now: Mapping[str, float]) -> Variable:
@@ -357,8 +227,7 @@ def opened(path: str) -> Fmu:
 
 @cache
 def _opened(path: Path, changed: int) -> Fmu:
-    d = _description(path)
-    return Cosimulation(path, d) if d.modelExchange is None else Fmu(path, d)
+    return Fmu(path, _description(path))
 
 
 def _description(path: Path) -> ModelDescription:
@@ -369,13 +238,10 @@ def _description(path: Path) -> ModelDescription:
         raise InputError(f"{path}: no usable FMU: {' '.join(str(e).split())[:300]}") from None
     if found.fmiVersion[0] not in "23":
         raise InputError(f"{path}: FMI {found.fmiVersion}; FMI 2.0 or 3.0 was expected; export it anew")
-    only = found.coSimulation
-    if found.modelExchange is None and only is None:
-        raise InputError(f"{path}: an FMU of model exchange or of co-simulation was expected; export it anew")
-    if found.modelExchange is None and only.canBeInstantiatedOnlyOncePerProcess:
+    if found.modelExchange is None:
+        other = ", found one of co-simulation only, whose inside nobody can ask" * bool(found.coSimulation)
         raise InputError(
-            f"{path}: can be opened once a process only, but slopes need runs beside each other; export it for "
-            "model exchange"
+            f"{path}: an FMU of model exchange was expected{other}; export it for model exchange"
         )
     return found
 
@@ -397,8 +263,7 @@ def _compiled(path: Path, d: ModelDescription, folder: Path) -> None:
     """Compile an unpacked FMU's C sources where it has no library for this machine. Raises InputError."""
     import fmpy
 
-    interface = d.modelExchange or d.coSimulation
-    name = interface.modelIdentifier
+    name = d.modelExchange.modelIdentifier
     names = (fmpy.platform, fmpy.platform_tuple)  # of FMI 2 and FMI 3
     if any((folder / "binaries" / n / f"{name}{fmpy.sharedLibraryExtension}").exists() for n in names):
         return
@@ -426,32 +291,20 @@ def _compiled(path: Path, d: ModelDescription, folder: Path) -> None:
         raise InputError(f"{said}, and its C sources do not compile: {' '.join(done.stderr.split())[:400]}")
 
 
-def _instantiated(path: Path, d: ModelDescription, folder: str) -> Any:
-    """Return a new instance, for model exchange where there is that. Raises InputError."""
+def _instance(path: Path, d: ModelDescription) -> Any:
+    """Return a new instance in continuous time. Raises InputError."""
     import fmpy
 
-    interface = d.modelExchange or d.coSimulation
-    of_version = {
-        "2": (fmpy.fmi2.FMU2Model, fmpy.fmi2.FMU2Slave),
-        "3": (fmpy.fmi3.FMU3Model, fmpy.fmi3.FMU3Slave),
-    }
-    model = of_version[d.fmiVersion[0]][d.modelExchange is None]
+    folder = _extracted(path, d)
+    model = fmpy.fmi2.FMU2Model if d.fmiVersion[0] == "2" else fmpy.fmi3.FMU3Model
     try:
         found = model(
             guid=d.guid,
             unzipDirectory=folder,
-            modelIdentifier=interface.modelIdentifier,
+            modelIdentifier=d.modelExchange.modelIdentifier,
             instanceName="thermoctl",
         )
         found.instantiate()
-    except Exception as e:
-        raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
-    return found
-
-
-def _instance(path: Path, d: ModelDescription) -> Any:
-    found = _instantiated(path, d, _extracted(path, d))
-    try:
         if d.fmiVersion[0] == "2":
             found.setupExperiment(startTime=0.0)
         found.enterInitializationMode()

@@ -2,8 +2,6 @@
 
     d(state)/dt = fmu(derivative, states, inputs, parameters),    output = fmu(output, ...)
 
-An FMU of co-simulation has outputs only.
-
 The map has the sections `inputs`, `states`, `outputs` and `parameters`, with the FMU's names as keys. An
 entry's keys are those of a plant file (docs/how-to/diagnose.md, "An FMU as the plant").
 """
@@ -146,25 +144,13 @@ class _Plant:
         """Return the expression of a result, with the states and inputs that it depends on."""
         fmu = self.fmu
         read = [n for n in (*fmu.states, *fmu.inputs) if n in fmu.depends[result]]
-        values = {
-            self._argument(n): str(self.constants[n].value) if n in self.constants else self.names[n]
-            for n in read
-        }
+        values = {n: str(self.constants[n].value) if n in self.constants else self.names[n] for n in read}
         values |= {n: self.names[n] for n in self.parameters}
         return f'fmu("{fmu.path}", "{result}"' + "".join(f', "{n}", {v}' for n, v in values.items()) + ")"
-
-    def _argument(self, name: str) -> str:
-        """Return the argument for a state or an input; co-simulation distinguishes held inputs."""
-        if not self.fmu.runs or name in self.constants:
-            return name
-        entry = self._entry("inputs", name, self._input(self.fmu.inputs[name]))
-        return f"hold({name})" if entry.value["between_samples"].value == "hold" else name
 
     def _readings(self) -> dict[str, str]:
         """Return outputs that are a state's reading, and the state: equal at random points."""
         fmu, random = self.fmu, np.random.default_rng(0)
-        if not fmu.states:
-            return {}
         free = {**fmu.states, **fmu.inputs}
         points = {
             n: v.start + (abs(v.start) or 1.0) * random.uniform(-0.1, 0.1, PROBES) for n, v in free.items()

@@ -13,7 +13,6 @@ import numpy as np
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
-from thermoctl.plant.fmu import Cosimulation, opened
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
 from thermoctl.plant.recordings import in_plant_units
@@ -398,12 +397,8 @@ class Model:
         if y is None:
             y, dy = self._observe(excitation, u, p, width, x, dx, nq, sensitivities, buffers)
         if self.code.fmus and not np.isfinite(y).all():
-            refused = [f.refusal for f in map(opened, self.code.fmus) if isinstance(f, Cosimulation)]
             row = int(np.argmin(np.isfinite(y).all(axis=1)))
-            raise SimulationError(
-                f"{excitation.name}: "
-                + next(filter(None, refused), f"the FMU has no output at t = {excitation.t[row]:g} s")
-            )
+            raise SimulationError(f"{excitation.name}: the FMU has no output at t = {excitation.t[row]:g} s")
         return Simulation(excitation.t, x, y, None if at_once else dx, dy, int(info[0]), int(info[1]))
 
     @property

@@ -106,12 +106,6 @@ def words(name: str, count: int, per_word: int) -> tuple[str, ...]:
     return tuple(f"{name}_bits" + (f"_{k + 1}" if k else "") for k in range(-(-count // per_word)))
 
 
-def word_of(name: str, item: int, per_word: int) -> tuple[str, int]:
-    """Return the word of bits that holds item number `item`, and its place in this word."""
-    k, place = divmod(item, per_word)
-    return words(name, (k + 1) * per_word, per_word)[k], place
-
-
 class Row:
     """The record row of a rig: its signals, their index, and where its parts lie.
 
