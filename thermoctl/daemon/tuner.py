@@ -2,8 +2,8 @@
 
 compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
 of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. It is
-proven by samples that came after it. Where it predicts those worse than the model before, that one is current
-again. No further one is proposed until then. `status` shows the progress in percent.
+proven by samples that came after it, also after a restart. Where it predicts those worse than the model
+before, that one is current again. No further one is proposed until then. `status` shows the progress in percent.
 """
 
 from __future__ import annotations
@@ -53,12 +53,22 @@ class Tuning:
         self.row = of_channels(channels)
         self.tuner = tuner or Tuner(model)
         self.period_s = model.expansion_period_s
-        self.unproven: tuple[CompensatorModel, Path] | None = (
-            None  # the model before, the file of the new one
-        )
+        self.unproven = self._unproven()
         self.zero_um = self.air_c = float("nan")
         self.proposed_s = 0.0
         self._rows: list[np.ndarray] = []
+
+    def _unproven(self) -> tuple[CompensatorModel, Path, Path] | None:
+        """Return the model before a current one that was tuned online, its file and that of the tuned one."""
+        if self.folder is None:
+            return None
+        try:
+            path = modelfile.current(self.folder)
+            name = modelfile.load_calibration(path).figures.get("tuned_from")
+            before = self.folder / str(name)
+            return None if name is None else (modelfile.load_model(before), before, path)
+        except InputError:
+            return None
 
     def take(self, rows: np.ndarray) -> None:
         """Take rows (K, signals) of consecutive ticks; each period of the model makes one sample."""
@@ -93,14 +103,14 @@ class Tuning:
             self.proposed_s = float(rows[-1, _T])
             self._propose()
 
-    def _prove(self, before: CompensatorModel, path: Path) -> None:
+    def _prove(self, before: CompensatorModel, old: Path, path: Path) -> None:
         """Compare the newest calibration with the one before, by the samples since; keep the better one."""
-        if len(self.tuner.recent) < self.tuner.hold:
-            return
-        self.unproven = None
         was, is_now = self.tuner.error_um(before), self.tuner.error_um(self.tuner.model)
-        if is_now > was and self.folder is not None and modelfile.current(self.folder) == path:
-            back = modelfile.roll_back(self.folder)
+        if len(self.tuner.recent) < self.tuner.hold or not np.isfinite(was + is_now):
+            return  # too few samples with a reference
+        self.unproven = None
+        if is_now > was and modelfile.current(old.parent) == path:
+            back = modelfile.roll_back(old.parent, old.name)
             self.say(
                 f"{path}: {is_now:.3g} um since then against {was:.3g} um with the one before; {back} is current again"
             )
@@ -118,10 +128,10 @@ class Tuning:
         if new is None:
             return
         if self.folder is not None:
-            path = modelfile.install(
-                self.folder, new, self.rig, figures={"tuned_online": why, "samples": self.tuner.bank.samples}
-            )
-            self.unproven = self.tuner.model, path
+            old = modelfile.current(self.folder)
+            figures = {"tuned_online": why, "samples": self.tuner.bank.samples, "tuned_from": old.name}
+            path = modelfile.install(self.folder, new, self.rig, figures=figures)
+            self.unproven = self.tuner.model, old, path
             self.say(
                 f"{path}: {why}; in use from the next start on, `thermoctl model rollback` takes it back"
             )
