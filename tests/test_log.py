@@ -53,3 +53,27 @@ def test_a_full_disk_ends_nothing_and_is_reported_afterwards():
     full = "keep = os.dup(2); os.dup2(os.open('/dev/full', os.O_WRONLY), 2)"
     (lost, line) = lines(full, "os.dup2(keep, 2); console_log('state', tick=9)")
     assert "2 lines are lost" in lost and "tick=9" in line
+
+
+def test_what_libraries_and_threads_say_are_events_too():
+    code = """
+import logging, threading, warnings
+from thermoctl.log import take_over
+take_over()
+take_over()
+logging.getLogger("can.pcan").warning("the %s is late", "bus")
+logging.getLogger("can.pcan").info("opened")
+warnings.warn("old argument")
+thread = threading.Thread(target=lambda: 1 // 0, name="reconnect meter")
+thread.start()
+thread.join()
+"""
+    found = [json.loads(line) for line in lines(JOURNAL, code)[2:]]
+    assert [f["event"] for f in found] == ["library", "library", "reconnect meter failed"]
+    assert (found[0]["name"], found[0]["level"], found[0]["message"]) == (
+        "can.pcan",
+        "warning",
+        "the bus is late",
+    )
+    assert "old argument" in found[1]["message"] and all(f["rig"] == "bench 3" for f in found)
+    assert "ZeroDivisionError" in found[2]["error"] and "Traceback" in found[2]["traceback"]

@@ -1,14 +1,18 @@
 """The project's log: structlog events on stderr, each with time, rig, axis and run.
 
 A terminal and a log file get readable lines, journald gets JSON. Nothing stops when a line cannot be
-written: lost lines are counted, and the next one that can be written says how many.
+written: lost lines are counted, and the next one that can be written says how many. In the daemon, warnings of
+libraries and errors that nothing caught are events, too (`take_over`).
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
+import threading
+import traceback
 from collections.abc import MutableMapping
 from typing import Any
 
@@ -29,6 +33,30 @@ def bind(**fields: Any) -> None:
 def console_log(event: str, **fields: Any) -> None:
     """Log an event; fields that are None are left out."""
     _logger.info(event, **fields)
+
+
+def failed(what: str, error: BaseException) -> None:
+    """Log an error that nothing caught, with its traceback."""
+    console_log(f"{what} failed", error=repr(error), traceback="".join(traceback.format_exception(error)))
+
+
+class _OfLibraries(logging.Handler):
+    """Makes events of what libraries report through `logging`."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record."""
+        console_log("library", name=record.name, level=record.levelname.lower(), message=record.getMessage())
+
+
+def take_over() -> None:
+    """Let libraries' warnings, and errors that end a thread of this process or of its forks, be events."""
+    root = logging.getLogger()
+    if not any(isinstance(handler, _OfLibraries) for handler in root.handlers):
+        root.addHandler(_OfLibraries(logging.WARNING))
+    logging.captureWarnings(True)
+    threading.excepthook = lambda hook: failed(
+        hook.thread.name if hook.thread else "thread", hook.exc_value or hook.exc_type()
+    )
 
 
 def _add_bound(_: Any, __: str, fields: MutableMapping[str, Any]) -> MutableMapping[str, Any]:

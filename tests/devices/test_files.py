@@ -199,6 +199,37 @@ def test_of_two_senders_of_a_group_the_first_or_the_named_one_counts(tmp_path):
     assert "source addresses 0 send it, too: give the wanted one as 'address'" in dev.silence()
 
 
+@pytest.mark.parametrize("address", [0, 0x5B])
+def test_the_named_sender_counts_whoever_came_first(tmp_path, address):
+    both = [(EXTENDED | 0x18FEEE00 | a, bytes((90 + a // 9,)) + bytes(7)) for a in (0x5B, 0, 0x17)]
+    dev = device(tmp_path, START + J1939, [ET1], "{t: air_c}", f", address: {address}")
+    assert read(dev, *both).value[ROLE["air_c"]] == 50 + address // 9
+
+
+def test_a_message_with_an_address_of_its_own_is_another_senders_by_address(tmp_path):
+    """Without a mark in the file, 29 bits are an identifier; the message says which key makes them a parameter group."""
+    dbc = START + J1939.replace("2566844158", str(EXTENDED | 0x18FEEE00))
+    other = (EXTENDED | 0x18FEEE5A, b"\x5a" + bytes(7))
+    dev = device(tmp_path, dbc, [ET1], "{t: air_c}")
+    assert read(dev, other).status[ROLE["air_c"]] != OK
+    assert "0x18FEEE5A came" in dev.silence() and "say address: 90" in dev.silence()
+    dev = device(tmp_path, dbc, [ET1], "{t: air_c}", ", address: 90")
+    assert read(dev, other).value[ROLE["air_c"]] == 50
+    typed = 'BA_DEF_ "ProtocolType" STRING ;\nBA_DEF_DEF_ "ProtocolType" "";\nBA_ "ProtocolType" "J1939";\n'
+    for fault in ("", FAULTS["overlapping signals"]):
+        dev = device(tmp_path, dbc + fault + typed, [ET1], "{t: air_c}")
+        assert read(dev, other).value[ROLE["air_c"]] == 50
+
+
+def test_a_message_of_11_bits_is_none_of_j1939(tmp_path):
+    formats = (
+        'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";\n'
+        'BA_DEF_DEF_ "VFrameFormat" "J1939PG";\n'
+    )
+    dev = device(tmp_path, START + GOOD + formats, [V], "{v: voltage_v}")
+    assert read(dev, (801, bytes.fromhex("d204") + bytes(6))).value[ROLE["voltage_v"]] == pytest.approx(12.34)
+
+
 def test_parameter_groups_of_identifiers():
     assert pgn_of(EXTENDED | 0x18FEEE5A) == BY_PGN | 0xFEEE and pgn_of(0x7FF) == 0
     assert pgn_of(EXTENDED | 0x0CEF1234) == BY_PGN | 0xEF00  # below 240: the receiver's address follows

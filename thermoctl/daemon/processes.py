@@ -21,7 +21,7 @@ from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.tick.shared import BEATS, NO_MODEL, RESUMED, Shared
-from thermoctl.log import bind, console_log
+from thermoctl.log import bind, console_log, failed
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.rig.board import Board
@@ -245,6 +245,9 @@ def _run_child(name: str, main: Callable[..., int], arguments: tuple[Any, ...]) 
     except HardwareError as e:
         console_log(f"{name} ended", error=e)
         code = EXIT_HARDWARE
+    except Exception as e:
+        failed(name, e)
+        code = EXIT_FAILED
     sys.exit(code)
 
 

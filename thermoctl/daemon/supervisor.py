@@ -50,7 +50,7 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.daemon.unsaved import Unsaved
-from thermoctl.log import bind, console_log
+from thermoctl.log import bind, console_log, take_over
 from thermoctl.safe_file import WriteError
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
@@ -98,6 +98,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
 
     Raises InputError when it cannot be started.
     """
+    take_over()
     bind(rig=rig_identity(settings))
     if not COMPILED:
         log(

@@ -188,19 +188,26 @@ class Dbc(BusSpec):
     faults: Mapping[str, str] = field(default_factory=dict)  # MESSAGE or MESSAGE.SIGNAL -> why it is unusable
     warning: str = ""  # file, line and message of what was read in spite of a fault
 
+    @property
+    def address(self) -> int:
+        """Return the address where a binding gives none; -1: of any source address."""
+        return min(self.node_shift, 0)
+
     def can_id(self, message: str, address: int) -> int:
         """Return the identifier of a message, with bit 31 for 29 bits."""
         found = self.database.get_message_by_name(message)
         node = address << self.node_shift if self.node_shift >= 0 else 0
         return found.frame_id + node | (0x8000_0000 if found.is_extended_frame else 0)
 
-    def is_j1939(self, message: str) -> bool:
-        """Return whether a message is received by its parameter group, from any source address.
+    def is_j1939(self, message: str, address: int = -1) -> bool:
+        """Return whether a message is received by its parameter group, from any source address or from `address`.
 
-        So are messages of the DBC format J1939PG, and those of source address 254, which no sender has."""
+        So are messages of the DBC format J1939PG, those of source address 254, which no sender has, and all of
+        29 bits where the binding gives an address."""
         found = self.database.get_message_by_name(message)
-        no_sender = found.is_extended_frame and found.frame_id & 0xFF == NULL_ADDRESS
-        return self.node_shift < 0 and (found.protocol == "j1939" or no_sender)
+        if self.node_shift >= 0 or not found.is_extended_frame:
+            return False
+        return found.protocol == "j1939" or found.frame_id & 0xFF == NULL_ADDRESS or address >= 0
 
 
 @dataclass(frozen=True)

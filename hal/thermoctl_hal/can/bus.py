@@ -15,8 +15,8 @@ number. A device may want a parameter group of J1939 instead, BY_PGN | its numbe
 any priority. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
 `long_frames`: a device that does not expect them never sees them.
 
-Bus-off: the kernel's error frames and those of gs_usb tell it, PCAN raises an error, others report a state
-(`can.BusState.ERROR`). An slcan adapter has no message for it.
+Bus-off: the kernel's error frames and those of gs_usb tell it, others raise an error that says so (PCAN) or
+report a state (`can.BusState.ERROR`; IXXAT). An slcan adapter has no message for it.
 """
 
 from __future__ import annotations
@@ -156,6 +156,8 @@ class LibraryPort(CanPort):
         while arrived is not None and not self._closing.is_set():
             try:
                 message = self._bus.recv(READ_S)
+                if message is None:
+                    self._check_state()
             except Exception as e:  # interfaces of python-can raise errors of their own
                 if not self._closing.is_set():
                     arrived.append(e)
@@ -170,13 +172,15 @@ class LibraryPort(CanPort):
                 self._send(can_id, data)
                 self._pending = 0
             except (BlockingIOError, self._library.CanError) as e:
+                if _says_bus_off(e):
+                    raise _failed(e) from None
                 self._queue_full(e)
             except OSError as e:
                 if e.errno != errno.ENOBUFS:
                     raise
                 self._queue_full(e)
             except Exception as e:  # interfaces of python-can raise errors of their own
-                raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+                raise _failed(e) from None
         return 0
 
     def _send(self, can_id: int, data: bytes) -> None:
@@ -201,10 +205,8 @@ class LibraryPort(CanPort):
         )
         try:
             self._bus.send(message)
-        except OSError:
-            raise
         except Exception as e:  # interfaces of python-can raise errors of their own
-            raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+            raise _failed(e) from None
 
     def _queue_full(self, why: Exception) -> None:
         self.bad += 1
@@ -288,14 +290,12 @@ class LibraryPort(CanPort):
         if self._arrived is not None:
             found = self._arrived.popleft() if self._arrived else None
             if isinstance(found, Exception):
-                raise OSError(errno.EIO, f"{type(found).__name__}: {found}")
+                raise _failed(found)
             return found
         try:
             return self._bus.recv(0)
-        except OSError:
-            raise
         except Exception as e:
-            raise OSError(errno.EIO, f"{type(e).__name__}: {e}") from None
+            raise _failed(e) from None
 
     def close(self) -> None:
         """Leave the bus."""
@@ -304,6 +304,18 @@ class LibraryPort(CanPort):
             self._reader.join(1.0)
         with contextlib.suppress(Exception):  # interfaces of python-can raise errors of their own
             self._bus.shutdown()
+
+
+def _says_bus_off(error: Exception) -> bool:
+    """Return whether an interface's error tells of bus-off, by its words or its name."""
+    return bool(re.search(r"bus[\s_-]?off", f"{type(error).__name__} {error}", re.IGNORECASE))
+
+
+def _failed(error: Exception) -> OSError:
+    """Return the OSError for an error of an interface."""
+    if _says_bus_off(error):
+        return OSError(errno.ENETDOWN, BUS_OFF)
+    return error if isinstance(error, OSError) else OSError(errno.EIO, f"{type(error).__name__}: {error}")
 
 
 def _kernel_filter(can_id: int) -> dict[str, int | bool]:

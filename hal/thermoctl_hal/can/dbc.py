@@ -42,7 +42,7 @@ class DbcDevice(Device):
             source = typed(b.channel.source, DbcSource)
             message = spec.database.get_message_by_name(source.message)
             can_id = spec.can_id(source.message, binding.address)
-            if spec.is_j1939(source.message):
+            if spec.is_j1939(source.message, binding.address):
                 can_id = pgn_of(can_id)
             entry = self._messages.setdefault(can_id, (message, [], []))
             entry[1].append((i, source))
@@ -85,7 +85,8 @@ class DbcDevice(Device):
         if entry is not None or group not in self._messages:
             return entry
         address = can_id & 0xFF
-        if address == (self.binding.address or self._sender.setdefault(group, address)):
+        wanted = self.binding.address
+        if address == (wanted if wanted >= 0 else self._sender.setdefault(group, address)):
             return self._messages[group]
         self._others.add(address)
         return None
@@ -101,6 +102,11 @@ class DbcDevice(Device):
             elif can_id ^ EXTENDED in self._messages:
                 here, there = (29, 11) if can_id & EXTENDED else (11, 29)
                 self._why = f"0x{can_id & ~EXTENDED:X} came as {here}-bit id, the DBC file says {there} bits"
+            elif can_id & EXTENDED and pgn_of(can_id) in map(pgn_of, self._messages):
+                self._why = (
+                    f"0x{can_id & ~EXTENDED:X} came, the same message of J1939 from source address {can_id & 0xFF}: "
+                    f"say address: {can_id & 0xFF}"
+                )
             return
         try:
             values: Mapping[str, Any] = entry[0].decode_simple(data, False, True, True)

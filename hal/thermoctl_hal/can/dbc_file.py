@@ -37,6 +37,7 @@ _EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
 _FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
 _FORMAT_OF = re.compile(r'\s*BA_\s+"VFrameFormat"\s+BO_\s+(\d+)\s+([^;]*);')
 _WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
+_J1939 = re.compile(r'^\s*BA_\s+"ProtocolType"\s+"J1939', re.MULTILINE)
 _LINE = re.compile(r"at line (\d+)")
 
 
@@ -83,9 +84,15 @@ def load_dbc(path: Path) -> DbcFile:
         reason = ""
     except Exception as e:  # cantools raises parse errors of several libraries
         database, reason = None, _first_line(e)
-    if database is None:
-        return _by_message(path, text, reason)
-    return DbcFile(database, _doubled(m for m in database.messages))
+    found = (
+        _by_message(path, text, reason)
+        if database is None
+        else DbcFile(database, _doubled(m for m in database.messages))
+    )
+    if _J1939.search(text) and "VFrameFormat" not in text:
+        for message in found.database.messages:
+            message.protocol = "j1939"
+    return found
 
 
 def _first_line(error: Exception) -> str:

@@ -170,7 +170,9 @@ class DbcSender(SlcanDevice):
             source = typed(b.channel.source, DbcSource)
             if source.message == name:
                 values[source.signal] = self.reading(b) or 0.0
-        can_id = self._spec.can_id(name, self.binding.address)
+        can_id, address = self._spec.can_id(name, self.binding.address), self.binding.address
+        if address >= 0 and self._spec.is_j1939(name, address):
+            can_id = can_id & ~0xFF | address
         return can_id, bytes(message.encode(values, strict=False))
 
 
