@@ -1,8 +1,8 @@
 """The project's log: structlog events on stderr, each with time, rig, axis and run.
 
 A terminal and a log file get readable lines, journald gets JSON. Nothing stops when a line cannot be
-written: lost lines are counted, and the next one that can be written says how many. In the daemon, warnings of
-libraries and errors that nothing caught are events, too (`take_over`).
+written: lost lines are counted, and the next one that can be written says how many. `take_over` makes events
+of libraries' warnings and of errors that nothing caught.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 compensation.tune starts it. It never touches the loop. A better model becomes a new calibration in the folder
 of compensation.model. The daemon uses it from its next start; `thermoctl model rollback` undoes it. It is
 proven by samples that came after it, also after a restart. Where it predicts those worse than the model
-before, that one is current again. No further one is proposed until then. `status` shows the progress in percent.
+before, that one is current again. No further one is proposed until then. `status` shows the progress.
 """
 
 from __future__ import annotations

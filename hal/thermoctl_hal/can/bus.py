@@ -15,8 +15,8 @@ number. A device may want a parameter group of J1939 instead, BY_PGN | its numbe
 any priority. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
 `long_frames`: a device that does not expect them never sees them.
 
-Bus-off: the kernel's error frames and those of gs_usb tell it, others raise an error that says so (PCAN) or
-report a state (`can.BusState.ERROR`; IXXAT). An slcan adapter has no message for it.
+Bus-off: the kernel's error frames and those of gs_usb tell it, PCAN raises an error, IXXAT reports a state
+(`can.BusState.ERROR`). An slcan adapter has no message for it.
 """
 
 from __future__ import annotations
