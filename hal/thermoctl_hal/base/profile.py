@@ -202,8 +202,8 @@ class Dbc(BusSpec):
     def is_j1939(self, message: str, address: int = -1) -> bool:
         """Return whether a message is received by its parameter group.
 
-        So are messages of the DBC format J1939PG, and those of source address 254, which no sender has. Where the
-        binding gives an `address`, all of 29 bits are."""
+        So are messages of the DBC format J1939PG, and those of source address 254, which no sender has.
+        Where the binding gives an `address`, all of 29 bits are."""
         found = self.database.get_message_by_name(message)
         if self.node_shift >= 0 or not found.is_extended_frame:
             return False
