@@ -64,6 +64,9 @@ FAULTS = {
     "a comment without an object": 'CM_ 801 "OTHER";\n',
     "two signals of one name": 'BO_ 9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" H\n SG_ C : 8|8@1+ (1,0) [0|0] "" H\n',
     "no signal at all": "BO_ 9 OTHER: 8 DEV\n SG_ C 0|8@1+\n",
+    "an id in hexadecimal": 'BO_ 0x9 OTHER: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" HOST\n',
+    "a blank in a name": 'BO_ 9 OTHER MSG: 8 DEV\n SG_ C : 0|8@1+ (1,0) [0|0] "" HOST\n',
+    "no message": 'BO_ OTHER 9: 8 DEV\n SG_ Volts : 40|8@1+ (1,0) [0|0] "" HOST\n',
 }
 
 
@@ -80,6 +83,16 @@ def test_what_a_profile_does_not_name_may_be_wrong(tmp_path, fault, first):
     found = re.fullmatch(r".*a\.dbc:(\d+): .*", warning)
     assert found, warning
     assert line <= int(found[1]) <= line + 2 and re.search("OTHER|Absent", warning), warning
+
+
+@pytest.mark.parametrize("fault", ["an id without bit 31", "overlapping signals"])
+def test_a_comment_of_several_lines_is_no_message(tmp_path, fault):
+    """Old messages that somebody kept as a comment."""
+    comment = 'CM_ BO_ 801 "before:\nBO_ 801 READING: 8 DEV\n SG_ Volts : 0|8@1+ (9,0) [0|0]\nBO_ 802 T: 8 DEV\nend";\n'
+    dev = device(tmp_path, START + FAULTS[fault] + GOOD + comment, [V, T])
+    assert read(dev, (801, bytes.fromhex("d2043c0000000000"))).value[ROLE["voltage_v"]] == pytest.approx(
+        12.34
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +112,7 @@ def test_what_a_profile_names_must_be_sound(tmp_path, text, channel, words):
 
 
 @pytest.mark.parametrize(
-    "encoding", ["utf-8", "utf-8-sig", "latin-1", "cp1252", "utf-16", "utf-16-le", "utf-16-be"]
+    "encoding", ["utf-8", "utf-8-sig", "latin-1", "cp1252", "utf-16", "utf-16-le", "utf-16-be", "utf-32"]
 )
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_every_encoding_that_csv_files_have(tmp_path, encoding, end):
@@ -273,6 +286,7 @@ ODD = {
     "an orphaned count": ("[2023sub0]\nObjectType=7\nDataType=5\n", r"\[2023sub0\] has no object \[2023\]"),
     "numbers with leading zeros": ("[DeviceInfo]\nVendorNumber=001\nGranularity=\n", ""),
     "a percent sign": ("[2300]\nParameterName=100 %\nDataType=6\nDefaultValue=%(x)s\n", ""),
+    "a bracket forgotten": ("[3000\nDataType=6\n", ""),
     "another case": ("[1a00SUB1]\nDATATYPE=7\n[1A00]\nobjecttype=9\n", ""),
 }
 
@@ -286,6 +300,20 @@ def test_an_eds_file_is_read_in_spite_of_what_is_not_named(tmp_path, odd, encodi
     found = read_eds(path)
     assert [found.entries[k].data_type for k in ((0x6041, 0), (0x2022, 1))] == [6, 3]
     assert re.search(warning, found.warning) if warning else found.warning == ""
+
+
+@pytest.mark.parametrize(
+    "old,new",
+    [
+        ("=0x0006", '="0x0006"'), ("=0x0006", "=0x0006 # status"), ("=0x0006", "=0x0006;status"), ("=0x0006", "=UNSIGNED16"),
+        ("=0x0006", "=Unsigned16"), ("=0x0006", "=6"), ("DataType=", "DataType=\nDataType="), ("=", " = "), ("=", ": "),
+        ("[6041]", "[6041h]"), ("[6041]", "[0x6041] ; status"), ("[6041]", "[ 6041"), ("\n", "\n\t"),
+    ],
+)  # fmt: skip
+def test_spellings_of_an_eds(tmp_path, old, new):
+    path = tmp_path / "a.eds"
+    path.write_text(EDS.replace(old, new))
+    assert read_eds(path).entries[0x6041, 0].data_type == 6
 
 
 def test_compact_sub_objects_have_the_type_of_their_object(tmp_path):

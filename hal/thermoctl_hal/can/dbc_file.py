@@ -23,7 +23,10 @@ if TYPE_CHECKING:  # loading cantools takes a second
 
 EXTENDED, LONGEST_11, LONGEST_29 = 0x8000_0000, 0x7FF, 0x1FFF_FFFF
 NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"  # holds the signals that no message has
-_BLOCK = re.compile(r"\s*BO_\s+(\d+)\s+([^\s:]+)\s*:\s*(\d+)\s*(\S*)")
+_BLOCK = re.compile(r"\s*BO_\s+(0[xX][0-9A-Fa-f]+|\d+)\s+([^\s:][^:]*?)\s*:\s*(\d+)\s*(\S*)")
+_BEGINS_BLOCK = re.compile(r"\s*BO_\s")
+_TEXT = re.compile(r"\s*(?:CM_|BA_\w*)\s")  # statements whose text may go on over several lines
+_ENDS_TEXT = re.compile(r'"\s*;\s*$')
 _SIGNAL = re.compile(
     r"\s*SG_\s+(?P<name>\S+?)\s*(?P<mux>\b[mM]\d*M?)?\s*:\s*(?P<place>\d+\s*\|\s*\d+\s*@\s*[01]\s*[+-])\s*"
     r'\((?P<scale>[^)]*)\)\s*\[[^\]]*\]\s*"(?P<unit>[^"]*)"'
@@ -125,11 +128,32 @@ def _by_message(path: Path, text: str, reason: str) -> DbcFile:
             messages.append(message)
     faults |= _doubled(iter(messages))
     if not remarks:
-        line = _LINE.search(reason)
-        remarks.append((int(line[1]) if line else 1, f"{reason}: not needed for readings"))
+        remarks.append((_line_of(reason, text), f"{reason}: not needed for readings"))
     remarks.sort()
     more = f"; and {len(remarks) - 1} more" if len(remarks) > 1 else ""
     return DbcFile(Database(messages, strict=False), faults, f"{path}:{remarks[0][0]}: {remarks[0][1]}{more}")
+
+
+def _line_of(reason: str, text: str) -> int:
+    """Return the line that cantools speaks of: by its number, else the last one with the word that it quotes."""
+    if found := _LINE.search(reason):
+        return int(found[1])
+    word = re.search(r"'([^']+)'", reason)
+    lines = [n for n, line in enumerate(text.split("\n"), 1) if word and word[1] in line]
+    return lines[-1] if lines else 1
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines with their numbers, without those that continue a comment or an attribute's text."""
+    lines = text.split("\n")
+    until = 0
+    for number, line in enumerate(lines, 1):
+        if number <= until:
+            continue
+        if _TEXT.match(line) and line.count('"') % 2 and not _ENDS_TEXT.search(line):
+            ends = (n for n in range(number, len(lines)) if _ENDS_TEXT.search(lines[n]))
+            until = next(ends, number - 1) + 1
+        yield number, line
 
 
 def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
@@ -139,24 +163,39 @@ def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
     remarks: list[tuple[int, str]] = []
     signals: set[tuple[int, str]] = set()
     of: dict[int, list[_Block]] = defaultdict(list)
-    for number, line in enumerate(text.split("\n"), 1):
-        found = _BLOCK.match(line)
-        if found and found[2] != NO_MESSAGE:
-            blocks.append(_Block([(number, line)], int(found[1]), found[2], found[3]))
-            of[int(found[1])].append(blocks[-1])
-        elif (begin := _BEGINS_SIGNAL.match(line)) and blocks:
-            blocks[-1].lines.append((number, line))
-            signals.add((blocks[-1].number, begin[1]))
+    block: _Block | None = None
+    for number, line in _statements(text):
+        if _BEGINS_BLOCK.match(line):
+            block = _begun(number, line, remarks)
+            if block is not None:
+                blocks.append(block)
+                of[block.number].append(block)
+        elif begin := _BEGINS_SIGNAL.match(line):
+            if block is not None:
+                block.lines.append((number, line))
+                signals.add((block.number, begin[1]))
         elif (begin := _WORDS_OF.match(line)) and (int(begin[1]), begin[2]) not in signals:
             remarks.append((number, f"VAL_ {begin[1]} {begin[2]}: there is no such signal, ignored"))
         elif _FORMAT.match(line):
             attributes.append(line.strip())
-        else:
-            for pattern in (_TYPE, _EXTENDED_MUX, _FORMAT_OF):
-                if found := pattern.match(line):
-                    for block in of[int(found[1])]:
-                        block.more.append(line.strip())
+        elif found := next(filter(None, (p.match(line) for p in (_TYPE, _EXTENDED_MUX, _FORMAT_OF))), None):
+            for one in of[int(found[1])]:
+                one.more.append(line.strip())
     return blocks, attributes, remarks
+
+
+def _begun(line: int, text: str, remarks: list[tuple[int, str]]) -> _Block | None:
+    """Return the message that a BO_ line begins; None where it is no message."""
+    found = _BLOCK.match(text)
+    if found is None:
+        remarks.append((line, f"'{text.strip()[:40]}' is no message of the format, left out"))
+    if found is None or found[2] == NO_MESSAGE:
+        return None
+    is_hexadecimal = "x" in found[1].lower()
+    if is_hexadecimal:
+        remarks.append((line, f"{found[2]}: identifier {found[1]} in hexadecimal"))
+    number = int(found[1], 16 if is_hexadecimal else 10)
+    return _Block([(line, text)], number, found[2], found[3])
 
 
 def _message(
@@ -232,6 +271,8 @@ def _scale(text: str) -> str:
     parts = [p.strip() for p in re.split(r"[,;]", text)]
     if len(parts) == 4:  # a decimal comma in both numbers
         parts = [f"{parts[0]}.{parts[1]}", f"{parts[2]}.{parts[3]}"]
+    elif len(parts) == 3 and not parts[0].strip("+-0"):  # in the factor, which is not 0
+        parts = [f"{parts[0]}.{parts[1]}", parts[2]]
     if len(parts) != 2 or not all(_NUMBER.fullmatch(p) for p in parts):
         return ""
     return f"({float(parts[0])!r},{float(parts[1])!r})"

@@ -14,10 +14,12 @@ from pathlib import Path
 from thermoctl_hal.base.profile import Object, object_name
 from thermoctl_hal.base.text_file import read_text
 
-_SECTION = re.compile(r"\s*\[\s*([^\]]*?)\s*\]")
-_OBJECT = re.compile(r"(?:0x)?([0-9A-F]{4})(?:\s*sub\s*(?:0x)?([0-9A-F]{1,2}))?", re.IGNORECASE)
+_SECTION = re.compile(r"\s*\[\s*([^\];]*?)\s*(?:\]|$|;)")  # the second bracket may be missing
+_OBJECT = re.compile(r"(?:0x)?([0-9A-F]{4})h?(?:\s*sub\s*(?:0x)?([0-9A-F]{1,2})h?)?", re.IGNORECASE)
 _NUMBER = re.compile(r"(?:0x([0-9A-F]+)|([0-9A-F]+)h|(\d+))", re.IGNORECASE)
 _COMMENT = (";", "#", "//")
+_NAMES = ("boolean", "integer8", "integer16", "integer32", "unsigned8", "unsigned16", "unsigned32", "real32")
+"""Data types of CiA 301 from number 1 on, by name."""
 _VARIABLE = 0x7  # ObjectType; a missing one is a variable
 LAST_SUB = 254
 
@@ -38,7 +40,8 @@ class Entry:
     @property
     def data_type(self) -> int | None:
         """Return the number of the data type; None where there is none."""
-        return _number(self.keys.get("datatype", ""))
+        text = _plain(self.keys.get("datatype", "")).lower()
+        return _NAMES.index(text) + 1 if text in _NAMES else _number(text)
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,14 @@ class Eds:
         return any(o.number == index for o in self.entries)
 
 
+def _plain(text: str) -> str:
+    """Return a value without its comment, blanks and quotes."""
+    return re.split("[;#]", text)[0].strip().strip("'\"")
+
+
 def _number(text: str) -> int | None:
     """Return a number as EDS files write it: 7, 0x0007, 0007h; None for other text."""
-    found = _NUMBER.fullmatch(text.split(";")[0].strip())
+    found = _NUMBER.fullmatch(_plain(text))
     if found is None:
         return None
     return int(found[1] or found[2] or found[3], 10 if found[3] else 16)
@@ -84,7 +92,7 @@ def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, st
     counts: dict[int, int] = {}  # index -> line of its sub-index 0
     entry: Entry | None = None
     for number, line in enumerate(lines, 1):
-        text = line.strip().strip("\ufeff\0")
+        text = line.strip().strip("\ufeff\0\x1a")
         if not text or text.startswith(_COMMENT):
             if text.startswith("//"):
                 remarks.append((number, f"'{text[:40]}' is no comment of the format, passed over"))
@@ -100,11 +108,11 @@ def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, st
                     entries[item].again = entry
                     remarks.append((number, f"object {object_name(item)} stands twice, the first one counts"))
             continue
-        key, equals, value = text.partition("=")
-        if not equals:
+        key, *value = re.split("[=:]", text, maxsplit=1)
+        if not value:
             remarks.append((number, f"'{text[:40]}' is no line of the format, passed over"))
-        elif entry is not None:
-            entry.keys.setdefault(key.strip().lower(), value.strip())
+        elif entry is not None and value[0].strip():
+            entry.keys.setdefault(key.strip().lower(), value[0].strip())
     lost = ((n, i) for i, n in counts.items() if Object(i) not in entries)
     return entries, remarks + [(n, f"[{i:04X}sub0] has no object [{i:04X}]") for n, i in lost]
 
