@@ -135,7 +135,7 @@ def _by_message(path: Path, text: str, reason: str) -> DbcFile:
 
 
 def _line_of(reason: str, text: str) -> int:
-    """Return the line that cantools speaks of: by its number, else the last one with the word that it quotes."""
+    """Return the line that cantools means: by its number, else the last one with the word that it quotes."""
     if found := _LINE.search(reason):
         return int(found[1])
     word = re.search(r"'([^']+)'", reason)
