@@ -1,9 +1,15 @@
-"""Text of files that other programs wrote (DBC, EDS), in the encodings that they use."""
+"""Files that devices are described by: read again only after a change, in the encodings that programs use."""
 
 from __future__ import annotations
 
 import codecs
+from collections.abc import Callable
+from functools import lru_cache, wraps
 from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
+KEPT = 32  # files of each kind
 
 _MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"),  # begins as that of UTF-16
@@ -12,6 +18,24 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+
+
+def while_same(read: Callable[[Path], T]) -> Callable[[Path], T]:
+    """Let `read` parse a file again only where its time or size has changed; the result is shared."""
+
+    @lru_cache(maxsize=KEPT)
+    def kept(path: Path, stamp: tuple[int, int]) -> T:
+        return read(path)
+
+    @wraps(read)
+    def call(path: Path) -> T:
+        try:
+            found = path.stat()
+        except OSError:
+            return read(path)  # raises its own error
+        return kept(path.absolute(), (found.st_mtime_ns, found.st_size))
+
+    return call
 
 
 def read_text(path: Path) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from thermoctl_hal.base.text_file import read_text
+from thermoctl_hal.base.text_file import read_text, while_same
 
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Database, Message
@@ -76,6 +76,7 @@ class _Signal:
     text: str
 
 
+@while_same
 def load_dbc(path: Path) -> DbcFile:
     """Read a DBC file. Raises OSError; ValueError where no message can be read."""
     from cantools.database import load_string

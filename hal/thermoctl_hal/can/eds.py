@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from thermoctl_hal.base.profile import Object, object_name
-from thermoctl_hal.base.text_file import read_text
+from thermoctl_hal.base.text_file import read_text, while_same
 
 _SECTION = re.compile(r"\s*\[\s*([^\];]*?)\s*(?:\]|$|;)")  # the second bracket may be missing
 _OBJECT = re.compile(r"(?:0x)?([0-9A-F]{4})h?(?:\s*sub\s*(?:0x)?([0-9A-F]{1,2})h?)?", re.IGNORECASE)
@@ -73,6 +73,7 @@ def _number(text: str) -> int | None:
     return int(found[1] or found[2] or found[3], 10 if found[3] else 16)
 
 
+@while_same
 def read_eds(path: Path) -> Eds:
     """Read an EDS file. Raises OSError; ValueError where it has no object."""
     entries, remarks = _sections(read_text(path).split("\n"))

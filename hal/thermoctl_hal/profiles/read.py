@@ -9,6 +9,7 @@ from thermoctl import yamlfile
 from thermoctl.yamlfile import Section
 from thermoctl_hal.base.key import take
 from thermoctl_hal.base.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
+from thermoctl_hal.base.text_file import while_same
 from thermoctl_hal.base.units import dbc_unit, is_convertible
 from thermoctl_hal.buses import BUSES, part
 from thermoctl_hal.profiles.keys import PROFILE
@@ -16,12 +17,13 @@ from thermoctl_hal.profiles.read_drive import read_amplifier
 from thermoctl_hal.serial.read import read_line
 
 FORMAT = "thermoctl-device/1"
+_parsed = while_same(yamlfile.load)
 STATE = "state"  # channel of an amplifier that reports no state
 
 
 def load_profile(path: str | Path) -> Profile:
     """Read and check a profile. Raises InputError with file, line and what was expected."""
-    top = Section(yamlfile.load(path), "device profile")
+    top = Section(_parsed(Path(path)), "device profile")
     if (found := top.text("format")) != FORMAT:
         raise top.get("format").error(f"format: '{FORMAT}' was expected, found '{found}'")
     bus = top.text("bus", choices=BUSES)

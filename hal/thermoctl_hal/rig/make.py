@@ -16,8 +16,12 @@ from thermoctl_hal.rig.axes import AxisBackend
 from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.devices import DevicesBackend
 from thermoctl_hal.simulated.faulty import FaultInjector, schedule
-from thermoctl_hal.simulated.replay import replay_backend
-from thermoctl_hal.simulated.rig import simulated_backend
+
+PLAYED = {
+    "simulated": "thermoctl_hal.simulated.rig:simulated_backend",
+    "replay": "thermoctl_hal.simulated.replay:replay_backend",
+}
+"""Back ends without devices: imported where one is asked for, because they load the plant's packages."""
 
 
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:
@@ -55,12 +59,11 @@ def _devices_backend(settings: Settings, board: Board | None) -> DevicesBackend:
 
 def _plain_backend(settings: Settings, board: Board | None) -> Backend:
     kind = settings.hal.backend
-    if kind == "simulated":
-        return simulated_backend(settings)
-    if kind == "replay":
-        return replay_backend(settings)
     if kind == "devices":
         return _devices_backend(settings, board)
+    if kind in PLAYED:
+        played: Backend = part(PLAYED[kind])(settings)
+        return played
     raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
 
 

@@ -10,7 +10,6 @@ from thermoctl.configuration.settings import AXES, Settings
 from thermoctl.yamlfile import Node, load
 from thermoctl_hal.base.binding import Bound
 from thermoctl_hal.profiles.bind import bind
-from thermoctl_hal.simulated.rig import make_rig
 
 PLACEHOLDER = re.compile(r"X{4,}|Y{4,}|<[^>]*>")
 """Text of a template's port that stands for the user's own."""
@@ -42,6 +41,8 @@ def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
             ),
         )
     if settings.hal.backend == "simulated":
+        from thermoctl_hal.simulated.rig import make_rig  # loads the plant's packages
+
         yield from _unbound(settings, {*make_rig(settings).index, *SIMULATED}, "output of the plant")
     if settings.hal.backend != "devices":
         return
