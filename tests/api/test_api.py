@@ -135,7 +135,7 @@ def test_a_refit_with_its_residuals_and_profile(frames, result):
 
 
 def test_the_residual_figures_show_a_trend_and_pass_white_noise():
-    from thermoctl.api.plots import KOLMOGOROV, autocorrelation, cumulated_periodogram
+    from thermoctl.report.residuals import KOLMOGOROV, autocorrelation, cumulated_periodogram
 
     rng = np.random.default_rng(3)
     white = rng.normal(size=4000)

@@ -63,11 +63,11 @@ def test_findings_are_told_by_size_with_units():
         == "Found: radiation at block (probability above 0.99) and sensor lag of 4.21 s at reading (probability 0.98)."
     )
     assert gain == (
-        "They take the error of reading from 3.2 K after a refit alone (40.9 K as the plant came) to 0.252 K; "
-        "on recordings set aside from 3.4 K to 0.26 K."
+        "With them the error of reading falls from 3.2 K after a refit alone (40.9 K as the plant came) to 0.252 K; "
+        "on recordings set aside it falls from 3.4 K to 0.26 K."
     )
     assert rest == (
-        "0.03 K of reading remains that nothing known explains; 90 % of the misfit's energy is closed; "
+        "0.03 K of reading remains that nothing known explains, beside 0.02 K of noise; "
         "it enters at block and follows heat."
     )
 
@@ -111,7 +111,10 @@ def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("asked", "answer"),
     [
-        ("sensor_lag", "sensor_lag at reading: a finding, probability 0.980, confirmed with 0.996"),
+        (
+            "sensor_lag",
+            "sensor_lag at reading: a finding, probability 0.98; that other data confirm it above 0.99",
+        ),
         ("creep", "creep at v: refitted, and it or a part of it is not significant"),
         ("creep at w", "creep at w: it promised nothing in any screening"),
         ("cogging", "cogging at v: not refitted; to first order it gains at most 1.2 nats"),

@@ -1,24 +1,68 @@
-"""The reports, as a person sees them: every verdict of a diagnosis, in the light, in the dark, on a telephone and on paper."""
+"""The reports, as a person sees them: four verdicts of a diagnosis, light and dark, on a telephone, a screen and on paper."""
 
 import base64
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from thermoctl.cli import main
+from thermoctl.diagnosis.run import diagnose_files
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
+from thermoctl.recording.files import write_table
+from thermoctl.recording.table import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 spec = importlib.util.spec_from_file_location("make", ROOT / "docs/examples/heater/make.py")
 make = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(make)
 HEADER = "t,heat,air_temperature,temperature_1,temperature_2"
-
-
-def quiet_rig(rows, seed):
-    """The same rig where nobody put a lamp: no finding."""
-    return rows
+BLOCK = """format: thermoctl-plant/1
+title: Heated block
+inputs: {heat: {unit: W}, air: {unit: degC}}
+parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
+nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
+flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
+outputs: {T_block: {value: T, unit: degC, noise: 0.05}}
+"""
+RADIATES = BLOCK.replace(
+    "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
+)
+# Rectangles of all visible texts, each with what cuts it: the page's edge, the drawing or the box that it is in.
+LOOK = """(() => {
+  const texts = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), faults = [];
+  while (walker.nextNode()) {
+    const node = walker.currentNode, parent = node.parentElement;
+    if (!node.textContent.trim() || parent.closest('style,script') || !parent.checkVisibility()) continue;
+    const range = document.createRange(); range.selectNodeContents(node);
+    for (const r of range.getClientRects()) {
+      if (r.width < 1 || r.height < 1) continue;
+      const svg = parent.closest('svg'), wide = parent.closest('.wide');
+      const box = (svg || (wide && wide.scrollWidth <= wide.clientWidth ? wide : document.documentElement)).getBoundingClientRect();
+      const text = node.textContent.trim().slice(0, 40);
+      if (r.left < box.left - 1.5 || r.right > box.right + 1.5) faults.push('cut: ' + text);
+      texts.push({r, node, text});
+    }
+  }
+  for (let i = 0; i < texts.length; i++) for (let j = i + 1; j < texts.length; j++) {
+    const a = texts[i].r, b = texts[j].r;
+    if (texts[i].node === texts[j].node) continue;
+    const w = Math.min(a.right, b.right) - Math.max(a.left, b.left), h = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+    if (w > 2 && h > 0.3 * Math.min(a.height, b.height)) faults.push('overlap: ' + texts[i].text + ' | ' + texts[j].text);
+  }
+  if (document.documentElement.scrollWidth > innerWidth) faults.push('the page is wider than the window');
+  if (innerWidth < 640) for (const w of document.querySelectorAll('.wide'))
+    if (w.scrollWidth > w.clientWidth + 1) faults.push('a table is wider than the telephone: ' + w.textContent.slice(0, 40));
+  return [texts.length, faults];
+})()"""
+KINDS = {  # verdict, its picture, the window's size and theme, the part of the page that is kept
+    "explained": ({"explained"}, (1280, 900), False, 1500),
+    "ambiguous": ({"ambiguous"}, (1280, 900), False, 1500),
+    "nothing-missing": ({"consistent"}, (360, 780), False, 1900),
+    "unexplained": ({"unexplained", "partly_explained"}, (1280, 900), True, 1500),
+}
 
 
 def wobbling(rows, seed):
@@ -31,58 +75,67 @@ def wobbling(rows, seed):
     return rows
 
 
-@pytest.mark.slow  # three diagnoses and a browser: make test-browser
-@pytest.mark.parametrize(
-    ("name", "lamp_w", "spoil", "verdicts"),
-    [
-        ("explained", make.LAMP_W, quiet_rig, {"explained"}),
-        ("consistent", 0.0, quiet_rig, {"consistent"}),
-        ("unknown", 0.0, wobbling, {"unexplained", "ambiguous"}),
-    ],
-)
-def test_a_diagnosis_reads_well(name, lamp_w, spoil, verdicts, tmp_path, browser, monkeypatch):
-    monkeypatch.setattr(make, "LAMP_W", lamp_w)
-    runs = []
-    for seed in (1, 2):
-        runs.append(str(tmp_path / f"run_{seed}.csv"))
-        np.savetxt(
-            runs[-1], spoil(make.record(seed), seed), fmt="%.5g", delimiter=",", header=HEADER, comments=""
-        )
-    assert (
-        main(
-            (
-                f"diagnose --plant {ROOT / 'docs/examples/heater/plant.yaml'} {' '.join(runs)} --out {tmp_path / 'out'} "
-                "--quiet"
-            ).split()
-        )
-        == 0
-    )
-    browser.size(1100, 900)
-    for dark in (False, True):
-        browser.dark(dark)
-        browser.open(f"file://{tmp_path}/out/report.html")
-        verdict = browser.until(
-            "document.readyState === 'complete' && document.querySelector('.lead b').textContent"
-        )
-        assert verdict.rstrip(".").lower() in verdicts
-        assert browser.js("document.documentElement.scrollWidth <= innerWidth"), "nothing hangs over the edge"
-        light = browser.js("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        assert light is not dark
-        if (name, dark) in (("explained", False), ("unknown", True)):
-            browser.keep(
-                "report-diagnosis" if name == "explained" else "report-diagnosis-unknown", height=1500
-            )
+def recorded(name, folder, monkeypatch):
+    """Files of a plant and its recordings, whose diagnosis has the verdict."""
+    if name == "ambiguous":
+        t = np.arange(240) * 5.0
+        heat = np.where((np.abs(t - 156) < 36) | (np.abs(t - 636) < 36), 20.0, 0.0)
+        table = Table("run_1", "run_1", t, {"heat": heat, "air": np.full(len(t), 22.0)})
+        (folder / "plant.yaml").write_text(BLOCK)
+        write_table(folder / "run_1.csv", compile_plant(loads(RADIATES), ()).measure(table, seed=1))
+        return folder / "plant.yaml", [folder / "run_1.csv"]
+    monkeypatch.setattr(make, "LAMP_W", make.LAMP_W if name == "explained" else 0.0)
+    paths = [folder / f"run_{seed}.csv" for seed in ((1, 2, 3) if name == "explained" else (1, 2))]
+    for seed, path in enumerate(paths, 1):
+        rows = make.record(seed)
+        rows = wobbling(rows, seed) if name == "unexplained" else rows
+        np.savetxt(path, rows, fmt="%.5g", delimiter=",", header=HEADER, comments="")
+    return ROOT / "docs/examples/heater/plant.yaml", paths
+
+
+@pytest.mark.slow  # four diagnoses and a browser: make test-browser
+@pytest.mark.parametrize("name", KINDS)
+def test_a_diagnosis_reads_well(name, tmp_path, browser, monkeypatch):
+    verdicts, size, dark, height = KINDS[name]
+    plant, recordings = recorded(name, tmp_path, monkeypatch)
+    result = diagnose_files(plant, recordings, tmp_path / "out")
+    assert result["verdict"] in verdicts
+    assert result == json.loads((tmp_path / "out/diagnosis.json").read_text())
+    looked_at(browser, tmp_path / "out/report.html")
     assert str(tmp_path) not in browser.js("document.body.innerText"), "names, no paths"
-    assert browser.js(
-        "[...document.querySelectorAll('figure')].every(f => f.querySelector('figcaption').textContent.length > 20)"
-    )
+    browser.size(*size)
+    browser.dark(dark)
+    browser.open(f"file://{tmp_path}/out/report.html")
+    browser.until("document.readyState === 'complete' && document.querySelector('figure svg').id !== null")
+    first = browser.js("document.querySelector('figure').getBoundingClientRect().bottom / innerHeight")
+    assert first < 1.0, "verdict, sentence and curves are on the first screen"
+    browser.keep(f"report-{name}", height=height)
+
+
+def looked_at(browser, path):
+    """On every size and theme, folded and unfolded, no text covers another one and nothing is cut."""
+    for width in (360, 800, 1280):
+        browser.size(width, 900)
+        for dark in (False, True):
+            browser.dark(dark)
+            clean(browser, path)
+            ground = browser.js("getComputedStyle(document.body).backgroundColor")
+            assert (ground == "rgb(255, 255, 255)") is not dark
+    browser.size(718, 1000)  # A4 between its margins
+    browser.call("Emulation.setEmulatedMedia", media="print", features=[])
+    clean(browser, path)
+    pdf = browser.call("Page.printToPDF", printBackground=False, preferCSSPageSize=True)["data"]
+    assert base64.b64decode(pdf)[:5] == b"%PDF-"
+    browser.call("Emulation.setEmulatedMedia", media="", features=[])
     assert browser.js("performance.getEntriesByType('resource').length") == 0, "nothing from elsewhere"
-    browser.size(400, 900)
-    assert browser.js("document.documentElement.scrollWidth <= innerWidth"), (
-        "on a telephone tables scroll, the page does not"
-    )
-    pdf = base64.b64decode(
-        browser.call("Page.printToPDF", printBackground=False, preferCSSPageSize=True)["data"]
-    )
-    assert pdf[:5] == b"%PDF-" and len(pdf) > 20000
     assert browser.messages == []
+
+
+def clean(browser, path):
+    """Fail with the texts that overlap or are cut."""
+    browser.open(f"file://{path}")
+    browser.until("document.readyState === 'complete' && document.querySelector('.lead b').textContent")
+    for opened in ("false", "true"):
+        browser.js(f"for (const d of document.querySelectorAll('details')) d.open = {opened}")
+        count, faults = browser.js(LOOK)
+        assert count > 40 and faults == []

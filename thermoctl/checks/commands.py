@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 from typing import TextIO
@@ -85,6 +86,10 @@ def simulate(args: argparse.Namespace) -> int:
 
 
 def report(found: Sequence[Finding], out: TextIO) -> None:
-    """Print each finding on a line of its own."""
-    for finding in found:
-        print(finding, file=out)
+    """Print each finding on a line of its own; one that several recordings share is printed once."""
+    where: dict[Finding, list[str]] = {}
+    for f in found:
+        where.setdefault(dataclasses.replace(f, where=""), []).append(f.where)
+    for f, places in where.items():
+        shared = ", ".join(dict.fromkeys(places))
+        print(dataclasses.replace(f, where=shared), file=out)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from thermoctl.checks.commands import checked, report
@@ -24,6 +25,7 @@ from thermoctl.diagnosis import run
 from thermoctl.diagnosis.experiment.file import peaks
 from thermoctl.diagnosis.experiment.resolve import resolve
 from thermoctl.diagnosis.law.result import save_effect
+from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import sentences, what_next
 from thermoctl.diagnosis.show import read
 from thermoctl.diagnosis.workers import cluster
@@ -194,16 +196,19 @@ def save_law(args: argparse.Namespace) -> int:
 def summary(found: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
     console = Console() if sys.stdout.isatty() else Console(width=160)
-    console.print(f"[bold]{found['verdict'].replace('_', ' ')}[/]. {' '.join(sentences(found))}")
+    console.print(f"[bold]{found['verdict'].replace('_', ' ')}[/].", end=" ")
+    console.print(" ".join(sentences(found)), markup=False)
     if found["findings"]:
-        console.print(_findings(found["findings"]))
-    if found["alternatives"]:
-        table = _table("alternative", "where", "probability")
-        for a in found["alternatives"][:8]:
-            table.add_row(a["effect"], a["where"], f"{a['probability']:.3f}")
-        console.print(table)
-    console.print(_errors(found))
-    lines = [f"note: {note}" for note in found["notes"]]
+        rows = []
+        for f in found["findings"]:
+            first = (f["effect"], f["where"], f["equation"])
+            for row in figures.parameter_rows(f)[1]:
+                rows.append((*first, *row))
+                first = ("", "", "")
+        _print(console, (("effect", "where", "equation", "parameter", "value, 95 %", "unit"), rows))
+    _print(console, figures.alternative_rows(found))
+    _print(console, figures.error_rows(found))
+    lines = [f"note: {note}" for note in figures.merged(found["notes"])]
     if found["next_experiment"]:
         lines += _next_experiment(found["next_experiment"], Path(out))
     lines += [
@@ -218,35 +223,12 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
         console.print(line, markup=False)
 
 
-def _table(*titles: str) -> Table:
-    return Table(*titles, box=None, header_style="bold")
-
-
-def _findings(findings: Sequence[Mapping[str, Any]]) -> Table:
-    table = _table("effect", "where", "equation", "parameter", "value", "95 %")
-    for f in findings:
-        first = [f["effect"], f["where"], f["equation"]]
-        for name, p in f["parameters"].items():
-            value = f"{p['value']:.4g} {p['unit'] or ''}"
-            table.add_row(*first, name, value, f"± {1.96 * (p['sd'] or 0):.2g}")
-            first = ["", "", ""]
-    return table
-
-
-def _errors(found: Mapping[str, Any]) -> Table:
-    columns = {
-        "before": "as it came",
-        "refit_only": "refitted",
-        "after": "with the findings",
-        "held_out_refit_only": "held out: refitted",
-        "held_out_after": "held out: with the findings",
-    }
-    if not found["findings"] and not (found["remainder"] or {}).get("law"):
-        columns = {k: title for k, title in columns.items() if not k.endswith("after")}
-    table = _table("rms of", "noise", *columns.values())
-    for o, x in found["outputs"].items():
-        table.add_row(o, _number(x["noise"]), *(_number(found["fit"][k].get(o)) for k in columns))
-    return table
+def _print(console: Console, rows: figures.Rows) -> None:
+    if rows[1]:
+        table = Table(*rows[0], box=None, header_style="bold")
+        for row in rows[1]:
+            table.add_row(*map(escape, row))
+        console.print(table)
 
 
 def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
@@ -256,7 +238,3 @@ def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
         f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
         "or let `thermoctl diagnose --resolve` do it",
     ]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"

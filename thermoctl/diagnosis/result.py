@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from thermoctl.diagnosis.curves import Curve, curves_of
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.held_out import Worth
@@ -18,6 +20,7 @@ from thermoctl.diagnosis.law.find import Law
 from thermoctl.diagnosis.law.refit import PlacedLaw
 from thermoctl.diagnosis.law.result import law_entry
 from thermoctl.diagnosis.law.smooth import flow_unit
+from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.search.beam import Searched
 from thermoctl.diagnosis.verdict.decide import Decision, Posterior
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
@@ -31,6 +34,7 @@ FOLLOWS = (
     0.3  # of an output's variance: most that a plant of the right rig leaves, even where it lacks physics
 )
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
+MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
 BLOCKS, LARGE = (
     40,
@@ -96,10 +100,30 @@ class Diagnosis:
         """The residual of the outcome."""
         return self.left if self.extends else self.before
 
+    @cached_property
+    def came(self) -> list[np.ndarray] | None:
+        """Errors (N, outputs) of the plant as its file has it; None if it cannot be simulated."""
+        model = compile_plant(self.case.plant)
+        try:
+            return [x.y - model.run(x).y for x in self.case.drives(model)]
+        except SimulationError:
+            return None
+
     @property
     def extended(self) -> Plant:
         """The plant with the findings and the law, refitted."""
         return self.final.plant
+
+
+def curves(d: Diagnosis) -> list[Curve]:
+    """Return the measured and simulated outputs: those held out, then those of the fit."""
+    fitted = {"before": d.came or (), "refit_only": d.null.fit.residuals, "after": d.final.fit.residuals}
+    aside = dict(d.worth.errors) if d.extends else {k: v for k, v in d.worth.errors.items() if k != "after"}
+    plant, model = d.case.plant, d.null.fit.model
+    return [
+        *curves_of(plant, [model.excitation(t) for t in d.worth.tables], aside, True),
+        *curves_of(plant, d.case.drives(model), fitted if d.extends else {**fitted, "after": ()}, False),
+    ]
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
@@ -152,8 +176,13 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "promised": {f"{e} at {at}": gain for (e, at), gain in sorted(d.searched.promised.items())},
             "not_seen": [],
             "truncated": d.searched.truncated,
+            "outliers": [{"recording": r, "column": c, "times": times} for r, c, times in d.case.outliers],
             "notes": _notes(d),
-            "outputs": {o: {"unit": outputs[o].unit, "noise": s} for o, s in d.before.noise.items()},
+            "outputs": {
+                o: {"unit": outputs[o].unit, "noise": s, "step": outputs[o].resolution}
+                for o, s in d.remainder.noise.items()
+            },
+            "recordings": [c.entry() for c in curves(d)],
             "seconds": None,
         }
     )
@@ -169,8 +198,8 @@ def _notes(d: Diagnosis) -> list[str]:
         *unfinished(d.null, d.final),
         *filter(None, [d.unknown]),
         *(
-            f"{effect} at {where} is in the extended plant, but is not sure enough to be a finding "
-            f"(probability {d.posterior.effects.get((effect, where), 0.0):.2f})"
+            f"{effect} at {where} is in the extended plant, but is no finding (probability "
+            f"{chance(d.posterior.effects.get((effect, where), 0.0))})"
             for effect, where in unnamed
         ),
         *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
@@ -186,7 +215,11 @@ def unfinished(*fits: Fitted) -> list[str]:
     }
     return [
         f"the refit of {name} ended after {fit.iterations} steps below its maximum; another promised {0.5 * fit.left:.2g} nats: "
-        "its probability may be too small"
+        + (
+            "its probability may be too small"
+            if 0.5 * fit.left > MATTERS
+            else "too few to change a probability"
+        )
         for name, fit in names.items()
     ]
 
@@ -305,14 +338,13 @@ def _when(d: Diagnosis, output: str) -> list[list[float]]:
 
 def _as_it_came(d: Diagnosis) -> dict[str, float]:
     """Return the rms error of the plant with the parameters of its file."""
-    model = compile_plant(d.case.plant)
-    try:
-        errors = np.concatenate([x.y - model.run(x).y for x in d.case.drives(model)])
-    except SimulationError:
-        return dict.fromkeys(model.outputs, float("nan"))
+    names = list(d.case.plant.outputs)
+    if d.came is None:
+        return dict.fromkeys(names, float("nan"))
+    errors = np.concatenate(d.came)
     return {
         o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))
-        for j, o in enumerate(model.outputs)
+        for j, o in enumerate(names)
         if np.isfinite(errors[:, j]).any()
     }
 
@@ -367,7 +399,9 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
                     "below_best": final - w.score,
                     "reason": UNCONFIRMED
                     if key in d.refused
-                    else "less likely than the findings"
+                    else "less likely than the result"
+                    if w.score < final
+                    else "fits better, but not surely enough for a name"
                     if key in standouts(d.physics.get(keys, {}))
                     else "does not stand out of the misfit that it leaves",
                 }

@@ -38,10 +38,7 @@ class Estimate:
 def report(found: Fit, excitations: Sequence[Excitation] | None = None) -> list[Estimate]:
     """Return value, standard error and state of each parameter, from the Gauss-Newton matrix at the fit."""
     n = sum(1 for q, _ in found.unknowns if q in found.model.active)
-    residual = found.cost / max(found.samples - len(found.z), 1)
-    inverse = np.linalg.pinv(found.hessian, hermitian=True) * max(residual, 1.0)
-    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    corr = inverse / np.maximum(np.outer(sd, sd), 1e-300)
+    sd, corr = correlations(found)
     out = []
     for k, (q, r) in enumerate(found.unknowns[:n]):
         p = found.model.plant.parameters[q]
@@ -63,6 +60,14 @@ def report(found: Fit, excitations: Sequence[Excitation] | None = None) -> list[
         name = excitations[r].name if excitations is not None and r is not None else None
         out.append(Estimate(q, value, float(sd[k] * slope), p.unit, state, trades, name))
     return out
+
+
+def correlations(found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard errors of a fit's unknowns, as they are scaled there, and their correlations."""
+    residual = found.cost / max(found.samples - len(found.z), 1)
+    inverse = np.linalg.pinv(found.hessian, hermitian=True) * max(residual, 1.0)
+    sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    return sd, inverse / np.maximum(np.outer(sd, sd), 1e-300)
 
 
 def updated(plant: Plant, found: Fit, excitations: Sequence[Excitation]) -> Plant:

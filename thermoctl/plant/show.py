@@ -23,6 +23,7 @@ from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.text import Text
 
@@ -74,13 +75,6 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
             edges += [(len(vertices) + k, i, "read", "") for k in range(len(used))]
             vertices += [("in", n, n) for n in used]
     return vertices, edges
-
-
-def _outline(text: Text) -> np.ndarray:
-    """Return [[left, bottom], [right, top]] of a drawn text's box, in pixels."""
-    patch = text.get_bbox_patch()
-    assert patch is not None  # every text here is drawn with a box
-    return patch.get_window_extent().get_points()
 
 
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
@@ -137,50 +131,70 @@ def draw(plant: Plant, path: str | Path) -> None:
         drawing(plant).savefig(part, dpi=130, format=path.suffix[1:].lower())
 
 
-def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0) -> Figure:
-    """Return the network as a matplotlib Figure of at most `widest` inches.
+def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0, title: bool = True) -> Figure:
+    """Return the network as a matplotlib Figure of at most `widest` inches, as large as its texts need.
 
-    Nodes, flows and outputs named in `marked` are highlighted. A network that would be wider is compressed,
-    without labels on its edges.
-    """
+    Nodes, flows and outputs named in `marked` are highlighted. Labels of edges stand where there is room."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     vertices, edges = _graph(plant)
-    x, closer = _places(vertices, edges, widest)
-    span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
-    width = float(np.clip(2.0 + 1.75 * span[0], 6, min(40, widest)))
-    figure = Figure(figsize=(width, float(np.clip(1.6 + 1.3 * span[1] * closer**0.5, 3.5, 32))))
-    FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.02, 0.02, 0.96, 0.92))
+    figure = Figure()
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, 0, 1, 1))  # its units are inches
     axes.set_axis_off()
-    boxes = [_box(axes, at, vertex, marked) for at, vertex in zip(x, vertices, strict=True)]
-    margin = 0.45
-    axes.set_xlim(x[:, 0].min() - margin, x[:, 0].max() + margin)
-    axes.set_ylim(x[:, 1].min() - margin, x[:, 1].max() + margin)
-    figure.canvas.draw()  # computes the boxes' sizes, which the arrows need
-    sizes = [axes.transData.inverted().transform(_outline(q)) for q in boxes]
-    for a, b, kind, label in edges:
-        _arrow(axes, _edge(sizes[a], x[a], x[b]), _edge(sizes[b], x[b], x[a]), kind)
-        if label and closer > CLOSE:
-            _line_words(axes, (x[a] + x[b]) / 2, label)
-    _title_and_legend(figure, plant.title)
+    boxes = [_box(axes, vertex, marked) for vertex in vertices]
+    inch = figure.dpi
+    sizes = np.array([_size(box, canvas, inch) for box in boxes]).reshape(-1, 2)
+    x = _places(vertices, edges, sizes, widest)
+    for box, at in zip(boxes, x, strict=True):
+        box.set_position((at[0], at[1]))
+    taken = [np.array([at - q / 2, at + q / 2]) for at, q in zip(x, sizes, strict=True)]
+    low = np.min([q[0] for q in taken], axis=0, initial=0.0) - MARGIN
+    high = np.max([q[1] for q in taken], axis=0, initial=0.0) + MARGIN
+    for a, b, kind, _ in edges:
+        _arrow(axes, _edge(taken[a], x[a], x[b]), _edge(taken[b], x[b], x[a]), kind)
+    for a, b, _, label in edges:
+        if label:
+            _label(axes, (x[a] + x[b]) / 2, label, taken, canvas, inch)
+    low[1] -= _legend(axes, low, max(high[0], low[0] + 3.3), canvas, inch)
+    if title:
+        words = textwrap.fill(plant.title, max(int((high[0] - low[0]) * 9.5), 20))
+        head = axes.text(low[0], high[1], words, fontsize=12, weight="bold", va="bottom", zorder=2)
+        high = np.maximum(high, low + [_size(head, canvas, inch)[0], 0.0])
+        high[1] += _size(head, canvas, inch)[1]
+    high[0] = max(high[0], low[0] + 3.3)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    figure.set_size_inches(*(high - low))
     return figure
 
 
-CLOSE = 0.9  # edges have no labels below this share of the natural size
-WIDE_IN = 11.0  # from this width on the legend stands beside the title
+UNIT_IN = np.array([1.5, 0.85])  # inches of a unit of length, before texts push each other apart
+APART_IN = 0.12  # least distance of two boxes
+MARGIN = 0.08  # inches round the drawing
+PUSHES = 300  # rounds in which boxes that overlap push each other apart
 _STYLE = {  # edge, face, font size, word of the legend
-    "node": ("#1b3a5c", "#dce8f5", 9.5, "stored quantity"),
-    "in": ("#9c3d00", "#fde8d9", 8, "flow from outside"),
-    "out": ("#4a5560", "#eceff1", 8, "flow to outside"),
-    "read": ("#1d6b3a", "#e2f3e6", 8, "reading"),
+    "node": ("#0b6bcb", "#f3f6f9", 9.5, "stored quantity"),
+    "in": ("#c7621b", "#f3f6f9", 8.5, "flow from outside"),
+    "out": ("#7d8894", "#f3f6f9", 8.5, "flow to outside"),
+    "read": ("#1a7f37", "#f3f6f9", 8.5, "reading"),
 }
-_LINES = {"flow": ("#5a6b7b", "-"), "read": ("#1d6b3a", ":"), "uses": ("#9a86b8", "--")}
+_MARKED = "#b3261e"
+_LINES = {"flow": ("#7d8894", "-"), "read": ("#1a7f37", ":"), "uses": ("#9a86b8", "--")}
+_PAD = {True: 0.35, False: 0.2}  # of a node's box, and of another one, in letters
 
 
-def _places(vertices: list[Vertex], edges: list[Edge], widest: float) -> tuple[np.ndarray, float]:
-    """Return positions (vertices, 2) and the share to which the figure shrinks to `widest` inches."""
+def _size(text: Text, canvas: FigureCanvasAgg, inch: float) -> np.ndarray:
+    """Return width and height (2,) of a text with its box, in inches."""
+    box = text.get_bbox_patch()
+    pad = 2 * text.get_fontsize() / 72 * (box.get_boxstyle().pad if box else 0.1)
+    found = text.get_window_extent(canvas.get_renderer())
+    return np.array([found.width, found.height]) / inch + pad
+
+
+def _places(vertices: list[Vertex], edges: list[Edge], sizes: np.ndarray, widest: float) -> np.ndarray:
+    """Return positions (vertices, 2) in inches of boxes with sizes (vertices, 2), which do not overlap."""
     satellites = {"in", "out", "read"}
     readings = Counter(b for _, b, kind, _ in edges if kind == "read")
     lengths = []
@@ -188,32 +202,42 @@ def _places(vertices: list[Vertex], edges: list[Edge], widest: float) -> tuple[n
         if readings[b] > 1:
             length = 2.2
         elif kind == "flow" and {vertices[a][0], vertices[b][0]} & satellites:
-            length = 0.75
+            length = 1.0
         else:
-            length = 0.85 if kind == "read" else 1.6
+            length = 1.0 if kind == "read" else 1.7
         lengths.append((a, b, length))
     x = layout(len(vertices), lengths)
-    span = np.maximum(np.ptp(x, axis=0), 0.5) if len(x) else np.ones(2)
-    closer = min(1.0, widest / (2.0 + 1.75 * span[0]))
-    if closer < CLOSE:  # text does not shrink, so a satellite needs more room beside its node
-        x = layout(len(vertices), [(a, b, q * 1.45 if q < 1.0 else q) for a, b, q in lengths])
-    return x, closer
+    room = widest - float(sizes[:, 0].max(initial=0.0)) - 2 * MARGIN
+    if len(x) and np.ptp(x[:, 0]) * UNIT_IN[0] > room > np.ptp(x[:, 1]) * UNIT_IN[0]:
+        x = x[:, ::-1]  # upright
+    scale = UNIT_IN.copy()
+    scale[0] = min(scale[0], room / max(float(np.ptp(x[:, 0])) if len(x) else 0.0, 1e-9))
+    x = x * scale
+    for _ in range(PUSHES):
+        way = x[:, None] - x[None]
+        into = (sizes[:, None] + sizes[None]) / 2 + APART_IN - np.abs(way)
+        np.fill_diagonal(into[:, :, 0], 0.0)
+        depth = np.where((into > 1e-6).all(axis=2), into[:, :, 1], 0.0)
+        if not depth.any():
+            break
+        up = np.where(way[:, :, 1] == 0, np.arange(len(x))[:, None] - np.arange(len(x)), way[:, :, 1])
+        x[:, 1] += (0.25 * depth * np.sign(up)).sum(axis=1) + 0.0
+    return x
 
 
-def _box(axes: Axes, at: np.ndarray, vertex: Vertex, marked: Collection[str]) -> Text:
+def _box(axes: Axes, vertex: Vertex, marked: Collection[str]) -> Text:
     kind, key, label = vertex
     edge, face, size, _ = _STYLE[kind]
-    if key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked):
-        edge, face = "#b3261e", "#ffdad6"
+    found = key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked)
+    edge = _MARKED if found else edge
+    style = f"round,pad={_PAD[kind == 'node']}"
     shape = {
-        "boxstyle": "round,pad=0.35" if kind == "node" else "round,pad=0.2",
+        "boxstyle": style,
         "fc": face,
         "ec": edge,
-        "lw": 1.2 if kind == "node" else 0.6,
+        "lw": 2.0 if found else 1.2 if kind == "node" else 0.6,
     }
-    return axes.text(
-        at[0], at[1], label, ha="center", va="center", fontsize=size, color=edge, zorder=3, bbox=shape
-    )
+    return axes.text(0, 0, label, ha="center", va="center", fontsize=size, color=edge, zorder=3, bbox=shape)
 
 
 def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, kind: str) -> None:
@@ -230,25 +254,34 @@ def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, kind: str) -> None:
     axes.annotate("", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=line, zorder=1)
 
 
-def _line_words(axes: Axes, at: np.ndarray, label: str) -> None:
+def _label(
+    axes: Axes, at: np.ndarray, label: str, taken: list[np.ndarray], canvas: FigureCanvasAgg, inch: float
+) -> None:
+    """Write the label of an edge where it covers no box and no other label; `taken` gains its place."""
     words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
-    box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
-    axes.text(
-        at[0], at[1], words, fontsize=6.5, color="#5a6b7b", ha="center", va="center", zorder=2, bbox=box
+    box = {"boxstyle": "square,pad=0.1", "fc": "#ffffff", "ec": "none"}
+    text = axes.text(
+        at[0], at[1], words, fontsize=7.5, color="#7d8894", ha="center", va="center", zorder=2, bbox=box
     )
+    half = _size(text, canvas, inch) / 2
+    if any((at + half > q[0]).all() and (at - half < q[1]).all() for q in taken):
+        text.remove()
+    else:
+        taken.append(np.array([at - half, at + half]))
 
 
-def _title_and_legend(figure: Figure, title: str) -> None:
-    width = figure.get_figwidth()
-    letters = width * 9.5 - (45 if width >= WIDE_IN else 0)
-    figure.text(
-        0.02, 0.995, textwrap.fill(title, max(int(letters), 20)), fontsize=12, weight="bold", va="top"
-    )
-    for k, (edge, face, _, word) in enumerate(_STYLE.values()):
+def _legend(axes: Axes, low: np.ndarray, right: float, canvas: FigureCanvasAgg, inch: float) -> float:
+    """Write the kinds of boxes below the drawing, in rows up to `right`; return their height in inches."""
+    at, row = float(low[0]), 0
+    for edge, face, _, word in _STYLE.values():
         box = {"boxstyle": "round,pad=0.25", "fc": face, "ec": edge, "lw": 0.6}
-        at = 1.0 - 1.215 / width * (4 - k)
-        height = 0.025 if width < WIDE_IN else 0.965
-        figure.text(at, height, word, fontsize=8, color=edge, va="center", bbox=box)
+        text = axes.text(0, 0, word, fontsize=8, color=edge, va="center", bbox=box)
+        width = float(_size(text, canvas, inch)[0])
+        if at + width > right and at > low[0]:
+            at, row = float(low[0]), row + 1
+        text.set_position((at + 0.05, float(low[1]) - 0.2 - 0.26 * row))
+        at += width + 0.12
+    return 0.4 + 0.26 * row
 
 
 def table(plant: Plant) -> list[Table]:

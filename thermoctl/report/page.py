@@ -1,4 +1,4 @@
-"""The style of all pages: self-contained HTML without scripts, light and dark, fit for print."""
+"""The style of all pages: self-contained HTML without scripts, light and dark, on telephones and on paper."""
 
 from __future__ import annotations
 
@@ -7,32 +7,42 @@ import io
 import math
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_STYLE = """
-:root{color-scheme:light dark;--fg:#1b1f24;--bg:#fff;--soft:#5b6570;--line:#d5dae0;--mark:#0b6bcb;--tint:#f3f6f9;--bad:#b3261e;--good:#1a7f37}
-@media screen and (prefers-color-scheme:dark){:root{--fg:#e3e7eb;--bg:#14171a;--soft:#9aa4ae;
---line:#343b42;--mark:#6cb2ff;--tint:#1d2226;--bad:#ff8a80;--good:#6fdd8b}
-figure svg{filter:invert(.92) hue-rotate(180deg)}}
-body{font:15px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:62rem;margin:0 auto;padding:1.5rem}
-h1{font-size:1.6rem;margin:.2rem 0 1rem}h2{font-size:1.2rem;margin:2rem 0 .5rem;border-bottom:1px solid var(--line)}
-table{border-collapse:collapse;margin:.6rem 0;font-variant-numeric:tabular-nums}
-th,td{white-space:nowrap;font-size:.94em;padding:.25rem .7rem;border-bottom:1px solid var(--line);text-align:right}
-th:first-child,td:first-child,.text{text-align:left}td.text{white-space:normal;max-width:30rem}
-th{white-space:normal;vertical-align:bottom}td:first-child{white-space:nowrap}
-th{color:var(--soft);font-weight:600}caption{text-align:left;color:var(--soft);padding:.2rem 0}
-figure{margin:1rem 0}figure svg{width:100%;height:auto;max-height:46rem}
-.wide{overflow-x:auto}.lead{font-size:1.15rem}figcaption,.note{color:var(--soft);font-size:.92rem}
-pre{background:var(--tint);padding:.7rem;white-space:pre-wrap;overflow-wrap:anywhere}.good{color:var(--good)}.bad{color:var(--bad)}
-@media print{:root{color-scheme:light}body{max-width:none;padding:0;font-size:10.5pt}h2{break-after:avoid}
-figure,tr,pre{break-inside:avoid}thead{display:table-header-group}
-.wide{overflow:visible}pre{white-space:pre-wrap}}
-"""
-_NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·]*$")
+# Colours in figures, and their variables in the style sheet: each theme has shades of its own.
+BLACK, GREY, ORANGE, BLUE, FAINT = "#1b1f24", "#7d8894", "#c7621b", "#0b6bcb", "#d9d9d9"
+_VARIABLES = {
+    BLACK: "fg",
+    GREY: "soft",
+    ORANGE: "warm",
+    BLUE: "mark",
+    FAINT: "line",
+    "#000000": "fg",
+    "#f3f6f9": "tint",
+    "#1a7f37": "good",
+    "#b3261e": "bad",
+    "#ffffff": "bg",
+}
+_STYLE = Path(__file__).with_name("style.css")
+_NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·–]*$")
 _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
+_TEXT = {  # of figures: one size of letters, no frame
+    "font.size": 9,
+    **dict.fromkeys(
+        ("axes.titlesize", "axes.labelsize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 9
+    ),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), GREY),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor", "axes.labelcolor", "text.color"), BLACK),
+    "path.simplify": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "thermoctl",
+}
 
 
 def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str:
@@ -40,7 +50,7 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
     parts = [f"<section><h2>{html.escape(h)}</h2>\n{body}\n</section>" if h else body for h, body in sections]
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n<h1>{html.escape(title)}</h1>\n"
+        f"<title>{html.escape(title)}</title><style>{_STYLE.read_text()}</style></head><body>\n<h1>{html.escape(title)}</h1>\n"
         + (f'<p class="note">{html.escape(note)}</p>\n' if note else "")
         + "\n".join(parts)
         + "\n</body></html>\n"
@@ -48,7 +58,9 @@ def page(title: str, sections: Iterable[tuple[str, str]], note: str = "") -> str
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
-    """Return an HTML table; numbers are rounded and to the right, words to the left, None a dash."""
+    """Return an HTML table; numbers are rounded and to the right, words to the left, None a dash.
+
+    On a telephone each row is a card, with the heads beside the values."""
     rows = [list(row) for row in rows]
     words = [
         any(isinstance(v, str) and not _NUMERIC.match(v) for row in rows for v in row[k : k + 1])
@@ -57,18 +69,16 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = 
 
     def line(cells: Sequence[object], tag: str) -> str:
         """Return a row of the table; `tag`: th in the head, td in the body."""
-        return (
-            "<tr>"
-            + "".join(
-                f"<{tag}{' class=text' if k < len(words) and words[k] else ''}>{cell(v)}</{tag}>"
-                for k, v in enumerate(cells)
-            )
-            + "</tr>\n"
-        )
+        out = ""
+        for k, v in enumerate(cells):
+            kind = " class=text" if k < len(words) and words[k] else ""
+            of = f' data-head="{html.escape(head[k])}"' if tag == "td" and k and k < len(head) else ""
+            out += f"<{tag}{kind}{of}>{cell(v)}</{tag}>"
+        return f"<tr>{out}</tr>\n"
 
     top = f"<caption>{html.escape(caption)}</caption>" if caption else ""
     return (
-        f'<div class="wide"><table>{top}<thead>{line(head, "th")}</thead><tbody>\n'
+        f'<div class="wide"><table class="cards">{top}<thead>{line(head, "th")}</thead><tbody>\n'
         + "".join(line(row, "td") for row in rows)
         + "</tbody></table></div>"
     )
@@ -85,6 +95,11 @@ def cell(v: object) -> str:
     return (f"{mantissa}·10<sup>{int(power)}</sup>" if e else mantissa).replace("-", "−")
 
 
+def folded(title: str, body: str) -> str:
+    """Return a body that opens by a click on its title."""
+    return f"<details><summary>{html.escape(title)}</summary>{body}</details>" if body else ""
+
+
 def unit(name: str | None) -> str:
     """Return a unit as people write it: degC is °C, um is µm, no unit is nothing."""
     text = _UNIT.sub(lambda m: {"degC": "°C", "um": "µm", "us": "µs", "ohm": "Ω"}[m[0]], name or "")
@@ -96,15 +111,33 @@ def unit(name: str | None) -> str:
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
-def figure(fig: Figure, caption: str = "") -> str:
-    """Return a matplotlib figure as inline SVG with its caption; the figure is closed."""
-    import matplotlib.pyplot as plt
+def sheet(width: float, height: float, *panels: int, **how: object) -> tuple[Figure, list[Axes]]:
+    """Return a matplotlib Figure in the pages' style, sizes in inches, and its panels (rows, columns)."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_TEXT):
+        fig = Figure(figsize=(width, height), layout="constrained")
+        return fig, list(fig.subplots(*(panels or (1, 1)), squeeze=False, **how).flat)
+
+
+def figure(fig: Figure, caption: str = "", narrow: Figure | None = None) -> str:
+    """Return a matplotlib figure as inline SVG with its caption; `narrow`: the figure for telephones."""
+    body = _svg(fig)
+    if narrow:
+        body = f'<div class="broad">{body}</div><div class="narrow">{_svg(narrow)}</div>'
+    return f"<figure>{body}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _svg(fig: Figure) -> str:
+    """Return a figure as SVG without a ground, in the page's colours, lines to tenths of a point."""
+    import matplotlib
 
     for axis in fig.axes:
         axis.spines[["top", "right"]].set_visible(False)
     out = io.StringIO()
-    with plt.rc_context({"svg.fonttype": "none", "svg.hashsalt": "thermoctl"}):
-        fig.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
-    plt.close(fig)
+    with matplotlib.rc_context(_TEXT):
+        fig.savefig(out, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None})
     svg = out.getvalue()
-    return f"<figure>{svg[svg.index('<svg') :]}<figcaption>{html.escape(caption)}</figcaption></figure>"
+    svg = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(\.\d)\d+", r"\1", m[0]), svg[svg.index("<svg") :])
+    return re.sub("|".join(_VARIABLES), lambda m: f"var(--{_VARIABLES[m[0]]},{m[0]})", svg)

@@ -34,7 +34,11 @@ STATED = 12  # the same where the plant file states the noise, which then is not
 ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
+TOLD = 6  # times of outliers that a note lists of each column
 LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and shared rigs
+
+
+Outliers = tuple[tuple[str, str, tuple[float, ...]], ...]  # recording, column, times in s
 
 
 @dataclass
@@ -69,9 +73,8 @@ class Budget:
             self.fits_done += 1
             planned = min(max(self.planned, self.fits_done), self.fits)
             left = self._left(planned - self.fits_done + 1, 0)
-            self.progress(
-                f"searching: refit {self.fits_done} of {planned} planned so far (at most {self.fits}){left}"
-            )
+            of = f" of {planned} planned so far (at most {self.fits})" if self.fits_done <= planned else ""
+            self.progress(f"searching: refit {self.fits_done}{of}{left}")
 
     def screen(self) -> None:
         """Report that a hypothesis is screened for effects."""
@@ -92,7 +95,8 @@ class Case:
     """Data, catalogue and budget of a diagnosis.
 
     All hypotheses are scored in the same `coordinates` and `grids`. `off`: first samples less the plant's
-    start, of the outputs that contradict it. `rtol`: local error of every simulation."""
+    start, of the outputs that contradict it. `rtol`: local error of every simulation. `outliers`: readings left
+    out."""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -107,6 +111,7 @@ class Case:
     off: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
     memory: Memory = NOTHING  # of earlier recordings
+    outliers: Outliers = ()
 
     def drives(self, model: Model) -> list[Excitation]:
         """The recordings as a model reads them. Models that read the same columns share their values."""
@@ -171,13 +176,14 @@ def case(
         [
             *freed,
             *([fewer.note] if fewer.block > 1 else []),
-            *([f"{dropped} single outliers were left out"] if dropped else []),
+            *([told(dropped)] if dropped else []),
             *rig.guesses(),
         ],
         fewer.block,
         off,
         rtol,
         memory,
+        dropped,
     )
 
 
@@ -250,20 +256,24 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
     """Return the plant with free starts of bodies that first samples contradict, `Case.off`, and notes.
 
     Such a start is not known. A refit that is bound to it would take the way back from it for physics."""
-    model, nodes, notes = compile_plant(plant), dict(plant.nodes), []
-    off: dict[str, float] = {}
+    model, nodes = compile_plant(plant), dict(plant.nodes)
+    found: dict[str, list[float]] = {}
     for table in tables:
         for output, (error, sigmas) in start_errors(model, model.excitation(table)).items():
-            if sigmas <= SIGMAS:
-                continue
-            off[output] = max(error, off.get(output, 0.0), key=abs)
-            for n in sorted(ex.names(plant.outputs[output].value) & nodes.keys()):
-                sigma = max(abs(error), nodes[n].initial_sigma or 0.0)
-                nodes[n] = dataclasses.replace(nodes[n], initial_sigma=sigma)
-                notes.append(
-                    f"'{output}' starts {error:+.3g} from the plant's start: the start of '{n}' was fitted"
-                )
-    return dataclasses.replace(plant, nodes=nodes), off, list(dict.fromkeys(notes))
+            if sigmas > SIGMAS:
+                found.setdefault(output, []).append(error)
+    notes = []
+    for output, errors in found.items():
+        for n in sorted(ex.names(plant.outputs[output].value) & nodes.keys()):
+            sigma = max(*map(abs, errors), nodes[n].initial_sigma or 0.0)
+            nodes[n] = dataclasses.replace(nodes[n], initial_sigma=sigma)
+            span = f"{min(errors):+.3g}" + (f" to {max(errors):+.3g}" if len(errors) > 1 else "")
+            of = f" in {len(errors)} recordings" if len(errors) > 1 else ""
+            notes.append(
+                f"'{output}' starts {span} from the plant's start{of}: the start of '{n}' was fitted"
+            )
+    off = {output: max(errors, key=abs) for output, errors in found.items()}
+    return dataclasses.replace(plant, nodes=nodes), off, notes
 
 
 def _swing(drives: Sequence[Excitation], j: int) -> float:
@@ -278,12 +288,12 @@ def _without_outliers(
     residuals: Sequence[np.ndarray],
     as_stated: Sequence[np.ndarray],
     noise: Sequence[Noise],
-) -> tuple[list[Table], int]:
-    """The recordings without cells whose residual lies far from its neighbours', and how many those are.
+) -> tuple[list[Table], Outliers]:
+    """The recordings without cells whose residual lies far from its neighbours', and which those are.
 
     `as_stated`: residuals with the stated starts. The first readings, up to which these predict all, are no
     outliers: a refit that moved a start may have left them far behind."""
-    out, dropped = [], 0
+    out, dropped = [], []
     for t, e, stated in zip(tables, residuals, as_stated, strict=True):
         columns = dict(t.columns)
         for j, o in enumerate(plant.outputs.values()):
@@ -297,6 +307,17 @@ def _without_outliers(
             if len(odd) and len(odd) < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan
-                dropped += len(odd)
+                dropped.append((t.name, o.column, tuple(float(at) for at in t.t[odd] - t.t[0])))
         out.append(dataclasses.replace(t, columns=columns))
-    return out, dropped
+    return out, tuple(dropped)
+
+
+def told(outliers: Outliers) -> str:
+    """Return which readings were left out, as a sentence."""
+    count = sum(len(times) for *_, times in outliers)
+    places = []
+    for recording, column, times in outliers:
+        more = f" and {len(times) - TOLD} more" if len(times) > TOLD else ""
+        at = ", ".join(f"{t:.6g}" for t in times[:TOLD])
+        places.append(f"{column} in {recording} at {at}{more} s")
+    return f"{count} single outlier{'s were' if count > 1 else ' was'} left out: {'; '.join(places)}"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import stdtr
@@ -28,7 +28,8 @@ class Worth:
     `noise`: standard deviation of each output's noise. `reserved`: on recordings set aside; otherwise
     cross-validated, on data that took part in the choice.
     `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
-    without such recordings."""
+    without such recordings. `tables`: the recordings that the errors are of; `errors`: by the keys of a
+    result's `fit`, one array (N, outputs) for each of them."""
 
     before: dict[str, float]
     refit_only: dict[str, float]
@@ -37,6 +38,8 @@ class Worth:
     names: tuple[str, ...]
     noise: dict[str, float]
     worse: float = 0.0
+    tables: tuple[Table, ...] = ()
+    errors: Mapping[str, Sequence[np.ndarray]] = field(default_factory=dict)
 
     @property
     def share_closed(self) -> float | None:
@@ -55,26 +58,22 @@ def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Tabl
     return list(tables[:-1]), list(tables[-1:])
 
 
-def worth(
-    case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table], known: Worth | None = None
-) -> Worth:
-    """Errors on the reserve; without one, on every other block, the plants refitted to the rest.
-
-    `known`: of another hypothesis, whose errors without the findings are the same."""
+def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
+    """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
     noise = {o: n.sigma for o, n in zip(case.plant.outputs, case.noise, strict=True)}
     if reserve:
         if case.block > 1:
             reserve = [means(compile_plant(null.plant), t, case.block) for t in reserve]
-
-        names, model = tuple(t.name for t in reserve), null.fit.model
-        after = [errors_aside(case, best.plant, t) for t in reserve]
-        if known:
-            return dataclasses.replace(known, after=_rms(after, model))
-        came, alone = ([errors_aside(case, plant, t) for t in reserve] for plant in (case.plant, null.plant))
-        sizes = [_rms(errors, model) for errors in (came, alone, after)]
-        return Worth(sizes[0], sizes[1], sizes[2], True, names, noise, worse(alone, after))
-    before = _rms([errors_aside(case, case.plant, t) for t in case.tables], null.fit.model)
-    return Worth(before, _crossed(case, null), _crossed(case, best), False, (), noise)
+        plants = {"before": case.plant, "refit_only": null.plant, "after": best.plant}
+        errors = {k: [errors_aside(case, plant, t) for t in reserve] for k, plant in plants.items()}
+        lost = worse(errors["refit_only"], errors["after"])
+    else:
+        errors = {"before": [errors_aside(case, case.plant, t) for t in case.tables]}
+        errors |= {"refit_only": _crossed(case, null), "after": _crossed(case, best)}
+        lost = 0.0
+    before, refit_only, after = (_rms(e, null.fit.model) for e in errors.values())
+    names, tables = tuple(t.name for t in reserve), tuple(reserve or case.tables)
+    return Worth(before, refit_only, after, bool(reserve), names, noise, lost, tables, errors)
 
 
 def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
@@ -123,10 +122,10 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     return error - start @ (np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ rest) * prior)
 
 
-def _crossed(case: Case, f: Fitted) -> dict[str, float]:
-    """Errors on each half of the blocks, the plant refitted to the other half."""
+def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
+    """Return the errors in each recording's blocks but the first, the plant refitted to every other block."""
     measured = {o.column for o in case.plant.outputs.values()}
-    errors = []
+    errors = [np.full((len(t), len(f.fit.model.outputs)), np.nan) for t in case.tables]
     for parity in (0, 1):  # the first block is always fitted: an effect of the start is seen only there
         train = [_masked(t, measured, parity, True) for t in case.tables]
         model = compile_plant(f.plant)
@@ -138,10 +137,11 @@ def _crossed(case: Case, f: Fitted) -> dict[str, float]:
             for r, t in enumerate(case.tables):
                 aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
                 d = dataclasses.replace(drives[r], y=aside)  # its start is that of the whole recording
-                errors.append(d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y)
+                error = d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y
+                errors[r] = np.where(np.isfinite(aside), error, errors[r])
         except SimulationError:
-            errors += [np.full((len(t), len(model.outputs)), np.nan) for t in case.tables]
-    return _rms(errors, f.fit.model)
+            continue
+    return errors
 
 
 def _masked(table: Table, measured: set[str], parity: int, first: bool) -> Table:

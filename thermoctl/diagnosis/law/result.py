@@ -15,15 +15,15 @@ from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import Law
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import equation, law_rate
+from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
 from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
-from thermoctl.report.page import figure, table, unit
+from thermoctl.report.page import BLUE, FAINT, GREY, figure, sheet, table, unit
 from thermoctl.safe_file import make_folder, write_text
 from thermoctl.yamlfile import InputError
 
-WIDE = 1.96  # standard deviations to either side of a 95 % interval
 EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 
 
@@ -107,38 +107,26 @@ def law_section(law: Law | None, entry: Mapping[str, Any] | None) -> str:
     if law is None or entry is None:
         return ""
     body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
-    rows = [
-        (n, p["value"], unit(p["unit"]), f"± {WIDE * p['sd']:.2g}" if p["sd"] else "known")
-        for n, p in entry["parameters"].items()
-    ]
-    body += table(("parameter", "value", "unit", "95 %"), rows)
+    heads, rows = parameter_rows(entry)
+    body += table(heads, [(n, value, unit(of)) for n, value, of in rows])
     if entry["equivalent"]:
         body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["equivalent"]) + "</ul>"
-    where = "recordings set aside" if entry["held_out"] else "cross-validated data"
-    body += f"<p>On {where} it closes {100 * entry['share_closed']:.0f} % of the energy of the misfit.</p>"
-    return (
-        body
-        + _drawing(law)
-        + "<p>thermoctl effects save DIR NAME writes it as an effect of your own catalogue.</p>"
-    )
+    saved = "<p>thermoctl effects save DIR NAME writes it as an effect of your own catalogue.</p>"
+    return body + _drawing(law) + saved
 
 
 def _drawing(law: Law) -> str:
-    from matplotlib.figure import Figure
-
     c = law.curve
     if c is None:
         return ""
-    fig = Figure(figsize=(6, 3.4), layout="constrained")
-    axis = fig.subplots()
-    axis.fill_between(
-        c.at, c.flow - WIDE * c.sd, c.flow + WIDE * c.sd, color="0.85", label="any function, 95 %"
-    )
-    axis.plot(c.at, c.flow, ".", color="#1b1f24", label="any function")
-    axis.plot(c.at, c.law, color="#0b6bcb", label="law")
+    fig, (axis,) = sheet(5, 3.2)
+    band = (c.flow - WIDE * c.sd, c.flow + WIDE * c.sd)
+    axis.fill_between(c.at, *band, color=FAINT, lw=0, label="any function, 95 %")
+    axis.plot(c.at, c.flow, ".", color=GREY, label="any function")
+    axis.plot(c.at, c.law, color=BLUE, label="law")
     axis.set_xlabel(f"{c.signal.label} ({unit(c.signal.unit)})" if c.signal.unit else c.signal.label)
     axis.set_ylabel(f"flow ({unit(law.unit)})" if law.unit else "flow")
-    axis.legend(frameon=False, fontsize=8)
+    fig.legend(*axis.get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     return figure(
         fig,
         "The flow as a free function of the signal, and the law. Parts that the plant's own parameters absorb are the law's.",

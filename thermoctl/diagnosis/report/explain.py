@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import what_next
 
 SHOWN, LOST = 4, 3  # hypotheses; effects that were tried and lost
@@ -12,25 +13,14 @@ SHOWN, LOST = 4, 3  # hypotheses; effects that were tried and lost
 
 def explain(found: Mapping[str, Any]) -> str:
     """Return the verdict, its row and numbers, the likeliest hypotheses, the lost effects, the next step."""
-    decision = found["decision"]
-    numbers = ", ".join(f"{k} {v:.3g}" for k, v in decision.items() if k != "row" and v is not None)
-    lines = [
-        f"verdict: {found['verdict']}, because {decision['row']}",
-        f"numbers: {numbers}",
-        f"{'log evidence':>13}{'prior odds':>12}{'posterior':>11}{'stands out':>11}{'remainder':>11}  hypothesis",
-    ]
-    for h in found["hypotheses"][:SHOWN]:
-        name = " + ".join(h["effects"]) or "no effect"
-        stands = "-" if not h["effects"] else "no" if h["physics"] is None else f"{min(h['physics']):.3f}"
-        lines.append(
-            f"{h['log_evidence']:13.1f}{h['log_prior_odds']:12.1f}{h['posterior']:11.3f}{stands:>11}"
-            f"{h['remainder']:11.3f}  {name}"
-        )
-    lost = "; ".join(f"{e['effect']} at {e['where']} ({e['reason']})" for e in found["lost"][:LOST])
+    lines = [f"verdict: {found['verdict']}, because {found['decision']['row']}"]
+    lines += [f"    {value:>10}  {meaning}" for meaning, value in figures.decision_rows(found)[1]]
+    heads, rows = figures.hypothesis_rows(found)
+    lines += ["".join(f"{cell:>16}" for cell in row[1:]) + f"  {row[0]}" for row in (heads, *rows[:SHOWN])]
+    lost = "; ".join(f"{row[0]} ({row[1]})" for row in figures.lost_rows(found)[1][:LOST])
     lines.append(f"tried and lost: {lost or 'nothing'}")
-    rest = len(found["hypotheses"]) - SHOWN
     budget = "; the budget of refits ended the search" if found["truncated"] else ""
-    lines.append(f"hypotheses not shown: {max(rest, 0)} (in diagnosis.json){budget}")
+    lines.append(f"hypotheses not shown: {max(len(rows) - SHOWN, 0)} (in diagnosis.json){budget}")
     lines.append(f"what next: {what_next(found)}")
     return "\n".join(lines)
 
@@ -44,15 +34,14 @@ def why(found: Mapping[str, Any], asked: str) -> str:
 
     for f in found["findings"]:
         if is_asked(name := f"{f['effect']} at {f['where']}"):
-            return (
-                f"{name}: a finding, probability {f['probability']:.3f}, confirmed with {f['confirmed']:.3f}"
-            )
+            sure, confirmed = (figures.chance(f[k]) for k in ("probability", "confirmed"))
+            return f"{name}: a finding, probability {sure}; that other data confirm it {confirmed}"
     for e in found["lost"]:
         if is_asked(name := f"{e['effect']} at {e['where']}"):
             beside = f" beside {' and '.join(e['beside'])}" if e["beside"] else ""
             return (
-                f"{name}: refitted{beside}; {e['reason']} (probability {e['probability']:.3f}, "
-                f"{e['below_best']:.1f} nats below the result)"
+                f"{name}: refitted{beside}; {e['reason']} (probability {figures.chance(e['probability'])}, "
+                f"log odds {figures.below(e['below_best'])})"
             )
     for r in found["refused"]:
         for name in filter(is_asked, r["effects"]):

@@ -1,14 +1,15 @@
-"""A diagnosis in a few sentences, by size, from diagnosis.json alone."""
+"""A diagnosis in a few sentences, by size, from diagnosis.json alone.
+
+A sentence chooses its words from the numbers that it shows, as they are rounded there (`figures`)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-Result = Mapping[str, Any]  # the content of diagnosis.json
+from thermoctl.diagnosis.report.figures import Output, chance, outputs, size, with_interval
 
-WHOLE = 0.99  # share of the misfit's energy, from which a law closes all but the noise
+Result = Mapping[str, Any]  # the content of diagnosis.json
 
 NEXT = {
     "consistent": "Nothing has to be done. Effects that these inputs do not excite would not show: record wider steps to exclude them.",
@@ -18,8 +19,11 @@ NEXT = {
     "unexplained": "Look for the cause where and when the remainder is largest. Once it is known, add it to the catalogue "
     "(--effects DIR) and diagnose again.",
 }
-
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
+SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
+LIKELY = 0.05  # probability from which an effect beside a consistent plant is worth a word
+LARGER = 1.1  # errors over the sensors' noise, from which an agreement says how much larger they are
+NOT_RANDOM = 0.5  # probability of a remainder, from which one that is smaller than the noise is named
 
 
 def words(found: Result) -> str:
@@ -29,46 +33,45 @@ def words(found: Result) -> str:
 
 def sentences(found: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
-    lines = [_found(found)]
-    output = _worst(found)
-    if output is None:
-        return lines
-    if found["findings"]:
-        lines.append(_gain(found, output))
-    remainder = _remainder(found, output)
+    rows = outputs(found)
     law = law_sentence((found["remainder"] or {}).get("law"))
-    return [*lines, *(text for text in (remainder, law) if text)]
+    told = [_found(found, rows), law]
+    if rows and (found["findings"] or law):
+        told.append(_gain(found, max(rows, key=lambda o: o.gain)))
+    return [text for text in (*told, _remainder(found, rows)) if text]
 
 
 def what_next(found: Result) -> str:
     """Return the next step for a person."""
     proposed = found.get("next_experiment")
+    if proposed and proposed.get("also_helpful"):
+        return f"{proposed['also_helpful']} The best one inside them: {proposed['profile']}."
     if proposed:
         return (
             f"Run the proposed experiment ({proposed['profile']}) and diagnose again with its recording; "
             "`thermoctl diagnose --resolve` does both."
         )
-    perhaps = found["verdict"] == "consistent" and found["alternatives"]
-    text = PERHAPS if perhaps else NEXT[found["verdict"]]
+    text = NEXT[found["verdict"]]
+    if found["verdict"] == "consistent" and _likely(found):
+        text = PERHAPS
+    elif found["verdict"] == "unexplained" and _small(outputs(found)):
+        text = SMALL
     if found["truncated"]:
         text += " The budget of refits ended the search: more effects may be hidden."
     return text
 
 
-def name(finding: Mapping[str, Any]) -> str:
-    """Return an effect and its place; with its time, where it is a lag or delay."""
+def name(finding: Result) -> str:
+    """Return an effect and its place; with its time, where it has one."""
     text = str(finding["effect"]).replace("_", " ")
     parameters = list(finding.get("parameters", {}).values())
     if len(parameters) == 1 and parameters[0]["unit"] == "s":
         text += f" of {parameters[0]['value']:.3g} s"
     if finding.get("when"):
-        text += f" from {finding['when'][0][0]:.4g} s"
+        start, end = finding["when"][0]
+        ends = any(p["unit"] == "s" and abs(p["value"] - end) <= 1e-6 * abs(end) for p in parameters)
+        text += f" from {start:.4g} s" + (f" to {end:.4g} s" if ends else " on")
     return f"{text} at {finding['where']}"
-
-
-def chance(p: float) -> str:
-    """Return a probability in two digits; none is certain."""
-    return "above 0.99" if p >= 0.995 else "below 0.01" if p < 0.005 else f"{p:.2f}"
 
 
 def listed(items: Sequence[str]) -> str:
@@ -76,94 +79,89 @@ def listed(items: Sequence[str]) -> str:
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
-def difference(unit: str | None) -> str:
-    """Return the unit of a difference of readings: kelvins for degrees Celsius."""
-    return {"degC": "K", "1": "", None: ""}.get(unit, unit or "")
-
-
-def amount(found: Result, output: str, value: float | None) -> str:
-    """Return an error of an output with its unit."""
-    if value is None or not math.isfinite(value):
-        return "an unknown amount"
-    return f"{value:.3g} {difference(found['outputs'].get(output, {}).get('unit'))}".strip()
-
-
-def _found(found: Result) -> str:
-    names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
-    others = [f"{name(a)} ({chance(a['probability'])})" for a in found["alternatives"][:3]]
-    if found["verdict"] == "consistent":
-        text = "The recordings agree with the plant within its sensors' noise"
-        perhaps = f", and yet something may be missing: {', '.join(others)}."
-        return text + (perhaps if others else ": nothing is missing.")
-    if found["verdict"] == "ambiguous":
-        text = "Something is missing, but these recordings do not name it for sure"
-        text += f": most likely {listed(names)}" if names else ""
-        return text + (f"; also possible: {', '.join(others)}." if others else ".")
-    if names:
-        return f"Found: {listed(names)}."
-    law = (found["remainder"] or {}).get("law")
-    follows = f": it follows {listed(law['of'])} at {law['where']}" if law and law["of"] else ""
-    return f"Something is missing that no effect of the catalogue explains{follows}."
-
-
 def law_sentence(entry: Result | None) -> str:
     """Return the law of the remainder."""
     if not entry:
         return ""
     values = ", ".join(
-        f"{n} = {p['value']:.4g} {p['unit'] or ''}".strip() for n, p in entry["parameters"].items()
+        f"{n} = {with_interval(p['value'], p['sd'])} {p['unit'] or ''}".strip()
+        for n, p in entry["parameters"].items()
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
     at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
     acts = f"a flow {at}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
-    closes = f"It closes {100 * entry['share_closed']:.0f} % of the misfit's energy"
-    if entry["share_closed"] < WHOLE:
-        closes += "; a remainder stays"
-    return (
-        f"A law for it: {acts}, {entry['expression']}, with {values} "
-        f"(probability {chance(entry['probability'])}). {closes}."
-    )
+    chances = f"probability {chance(entry['probability'])}"
+    return f"A law for it: {acts}, {entry['expression']}, with {values} ({chances})."
 
 
-def _worst(found: Result) -> str | None:
-    """Return the output whose error the findings reduce most in its noise; without findings the worst one."""
-    fit, noise = found["fit"], {o: x["noise"] for o, x in found["outputs"].items()}
-
-    def size(o: str) -> float:
-        """Return the squared error that an output loses, over its noise."""
-        refit, after = fit["refit_only"].get(o) or 0.0, fit["after"].get(o) or 0.0
-        gain = refit**2 - after**2 if found["findings"] else refit**2
-        return float(gain / noise[o] ** 2) if noise[o] else 0.0
-
-    return max(noise, key=size, default=None)
+def _likely(found: Result) -> list[Result]:
+    return [a for a in found["alternatives"] if a["probability"] >= LIKELY]
 
 
-def _gain(found: Result, output: str) -> str:
-    fit = found["fit"]
+def _small(rows: Sequence[Output]) -> bool:
+    """Return whether no remainder exceeds its noise or the step of its readings."""
+    return bool(rows) and all(o.hidden for o in rows)
 
-    def of(key: str) -> str:
-        """Return an error of the output, with its unit."""
-        return amount(found, output, fit[key].get(output))
 
-    text = (
-        f"{'They take' if len(found['findings']) > 1 else 'It takes'} the error of {output} from {of('refit_only')} "
-        f"after a refit alone ({of('before')} as the plant came) to {of('after')}"
-    )
-    if str(fit["held_out"]).startswith("recordings"):
-        text += f"; on recordings set aside from {of('held_out_refit_only')} to {of('held_out_after')}"
+def _found(found: Result, rows: Sequence[Output]) -> str:
+    if found["verdict"] == "consistent":
+        over = max((o.over("refit_only") for o in rows), default=1.0)
+        text = "The recordings agree with the plant within its sensors' noise"
+        text += f" (errors up to {over:.2g} times it)" if over > LARGER else ""
+        perhaps = ", ".join(f"{name(a)} ({chance(a['probability'])})" for a in _likely(found)[:3])
+        return text + (
+            f", and yet something may be missing: {perhaps}." if perhaps else ": nothing is missing."
+        )
+    if found["verdict"] == "ambiguous":
+        every = sorted([*found["findings"], *found["alternatives"]], key=lambda a: -a["probability"])
+        told = ", ".join(f"{name(a)} ({chance(a['probability'])}{_doubt(a)})" for a in every[:4])
+        text = "Something is missing, but these recordings do not name it for sure"
+        return text + (f". Candidates, the likeliest first: {told}." if told else ".")
+    if found["findings"]:
+        names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
+        return f"Found: {listed(names)}."
+    law = (found["remainder"] or {}).get("law")
+    follows = f": it follows {listed(law['of'])} at {law['where']}" if law and law["of"] else ""
+    small = not law and _small(rows)
+    what = "A small systematic error stays" if small else "Something is missing"
+    doubted = [name(a) for a in found["alternatives"] if a.get("why_not")][:2]
+    fits = f" {listed(doubted).capitalize()} would fit, but nothing else confirms it." if doubted else ""
+    return f"{what} that no effect of the catalogue explains{follows}.{fits}"
+
+
+def _doubt(alternative: Result) -> str:
+    return f"; {alternative['why_not']}" if alternative.get("why_not") else ""
+
+
+def _gain(found: Result, o: Output) -> str:
+    many = len(found["findings"]) + bool((found["remainder"] or {}).get("law")) > 1
+    likely = f"With the likeliest{' ones' if many else ''}" if found["verdict"] == "ambiguous" else ""
+    came = o.size("before")
+    alone = f"{o.size('refit_only')} after a refit alone" + (f" ({came} as the plant came)" if came else "")
+    text = f"{likely or ('With them' if many else 'With it')} the error of {o.name} {o.change('refit_only', 'after', alone)}"
+    if o.size("held_out_refit_only") and o.size("held_out_after"):
+        aside = str(found["fit"]["held_out"]).startswith("recordings")
+        where = "on recordings set aside" if aside else "in parts predicted from the others"
+        text += f"; {where} it {o.change('held_out_refit_only', 'held_out_after')}"
     return text + "."
 
 
-def _remainder(found: Result, output: str) -> str:
+def _remainder(found: Result, rows: Sequence[Output]) -> str:
     r = found["remainder"]
-    if not r:
+    if not r or not rows or found["verdict"] == "explained":
         return ""
-    output = max(r["over_noise"], key=lambda o: r["over_noise"][o] or 0.0, default=output)
-    left = r["rms"].get(output)
-    if not left:
-        return ""
-    text = f"{amount(found, output, left)} of {output} remains that nothing known explains"
-    if found["findings"] and r["share_closed"] is not None:
-        text += f"; {100 * max(r['share_closed'], 0.0):.0f} % of the misfit's energy is closed"
+    o = max(rows, key=lambda row: row.over_noise or 0.0)
+    if found["verdict"] == "ambiguous" and (o.over_noise or 0.0) < LARGER:
+        return ""  # a candidate explains it
+    noise = size(o.noise, o.unit)
+    if o.left:
+        text = (
+            f"{size(o.left, o.unit)} of {o.name} remains that nothing known explains, beside {noise} of noise"
+        )
+        text += f" and steps of {size(o.step, o.unit)} in its readings" if o.below_step else ""
+    else:
+        if found["decision"].get("remains", 0.0) < NOT_RANDOM:
+            return ""
+        text = f"What remains of {o.name} is smaller than its noise of {noise}, but not random"
     text += f"; it enters at {r['node']}" if r["node"] else ""
     return text + (f" and follows {listed(list(r['follows']))}." if r["follows"] else ".")

@@ -1,0 +1,120 @@
+"""The curves of a report: measured beside simulated, and what of the error remains."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermoctl.diagnosis.curves import Curve
+from thermoctl.diagnosis.report.figures import COLUMNS, WIDE, percent
+from thermoctl.report.page import BLUE, FAINT, GREY, ORANGE, figure, sheet, unit
+from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, titled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BROAD, NARROW = 10.0, 3.6  # inches: of a page on a screen, and on a telephone
+POINTS = 200  # buckets of a curve, each drawn by its smallest and its largest value
+DOTS = 300  # measured values that are drawn
+ROOM = 0.15  # of the readings' range above and below them; a simulation further off leaves the picture
+GAP = 8.0  # of the usual step: a longer one is a gap
+FEWEST = 16  # values from which an autocorrelation says something
+SHADES = {"before": GREY, "refit_only": ORANGE, "after": BLUE}
+SCALES = ((2 * 86400.0, 86400.0, "days"), (7200.0, 3600.0, "h"), (0.0, 1.0, "s"))  # from a span, s
+
+
+def compared(c: Curve, caption: str) -> str:
+    """Return the figure of a measured output beside its simulations, their errors below."""
+    return figure(_compared(c, BROAD, 4.3), caption, _compared(c, NARROW, 4.3))
+
+
+def _compared(c: Curve, width: float, height: float) -> Figure:
+    fig, (top, low) = sheet(width, height, 2, 1, sharex=True, height_ratios=(3, 2))
+    scale, word = next((s, w) for least, s, w in SCALES if np.ptp(c.t) >= least)
+    t = (c.t - c.t[0]) / scale
+    dots = np.flatnonzero(np.isfinite(c.y))
+    dots = dots[:: max(1, -(-len(dots) // DOTS))]
+    top.plot(
+        *_dots(t[dots], c.y[dots]),
+        lw=3,
+        color=GREY,
+        alpha=0.55,
+        solid_capstyle="round",
+        label="measured",
+        zorder=1,
+    )
+    for k, e in c.errors.items():
+        fit = c.fit_percent(k)
+        label = COLUMNS[k] if fit is None else f"{COLUMNS[k]}: {percent(fit)} %"
+        style = {"lw": 0.9, "ls": "--"} if k == "before" else {"lw": 1.5}
+        top.plot(*_thin(t, c.y - e), color=SHADES[k], label=label, **style)
+        if k != "before":
+            low.plot(*_thin(t, e), color=SHADES[k], lw=0.9)
+    room = max(ROOM * float(np.ptp(c.y[dots])), 1e-12)
+    top.set_ylim(c.y[dots].min() - room, c.y[dots].max() + room)
+    low.axhline(0, color=FAINT, lw=0.8, zorder=0)
+    low.set_xlabel(f"time ({word})")
+    top.set_ylabel(_with_unit(c.output, unit(c.unit)))
+    low.set_ylabel(_with_unit("error", _difference(c.unit)))
+    fig.legend(
+        *top.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=4 if width > NARROW else 2,
+        frameon=False,
+    )
+    return fig
+
+
+def remaining(c: Curve, key: str, noise: float, caption: str) -> str:
+    """Return the figure of an error in its own scale, with its autocorrelation and cumulated periodogram."""
+    e = c.errors[key]
+    seen = e[np.isfinite(e)]
+    white = len(seen) >= FEWEST and float(np.ptp(seen)) > 0
+
+    def drawn(width: float, height: float, *panels: int) -> Figure:
+        """Return the panels in rows and columns; `white`: with those of the correlation."""
+        fig, axes = sheet(width, height, *panels)
+        _error(axes[0], c, e, noise)
+        if white:
+            draw_autocorrelation(axes[1], seen)
+            draw_periodogram(axes[2], seen)
+        return fig
+
+    if not white:
+        return figure(drawn(BROAD, 2.4), caption, drawn(NARROW, 2.2))
+    return figure(drawn(BROAD, 2.7, 1, 3), caption, drawn(NARROW, 6.6, 3, 1))
+
+
+def _error(axes: Axes, c: Curve, e: np.ndarray, noise: float) -> None:
+    scale, word = next((s, w) for least, s, w in SCALES if np.ptp(c.t) >= least)
+    axes.axhspan(-WIDE * noise, WIDE * noise, color=FAINT, lw=0, alpha=0.6)
+    axes.plot(*_thin((c.t - c.t[0]) / scale, e), color=BLUE, lw=0.7)
+    titled(axes, "error, and 95 % of the noise", f"time ({word})", _with_unit(c.output, _difference(c.unit)))
+
+
+def _dots(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return each point (N,) as a short line and a gap: in SVG a tenth of the size of markers."""
+    ends = ((t, t + 1e-4 * np.ptp(t)), (v, v))
+    return tuple(np.column_stack([a, b, np.full(len(a), np.nan)]).ravel() for a, b in ends)
+
+
+def _thin(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest value of each of POINTS buckets, with NaN in gaps."""
+    index = np.flatnonzero(np.isfinite(v))
+    if len(index) > 2 * POINTS:
+        parts = np.array_split(index, POINTS)
+        index = np.unique([q for part in parts for q in (part[v[part].argmin()], part[v[part].argmax()])])
+    steps = np.diff(t[index])
+    gap = np.flatnonzero(steps > GAP * np.median(steps)) if len(steps) else np.zeros(0, int)
+    return np.insert(t[index], gap + 1, np.nan), np.insert(v[index], gap + 1, np.nan)
+
+
+def _with_unit(text: str, its_unit: str) -> str:
+    return f"{text} ({its_unit})" if its_unit else text
+
+
+def _difference(its_unit: str | None) -> str:
+    """Return the unit of a difference of readings."""
+    return "K" if its_unit == "degC" else unit(its_unit)
