@@ -95,8 +95,8 @@ class Case:
     """Data, catalogue and budget of a diagnosis.
 
     All hypotheses are scored in the same `coordinates` and `grids`. `off`: first samples less the plant's
-    start, of the outputs that contradict it. `rtol`: local error of every simulation. `outliers`: readings left
-    out."""
+    start, of the outputs that contradict it. `rtol`: local error of every simulation. `outliers`: readings
+    left out."""
 
     plant: Plant
     tables: tuple[Table, ...]
