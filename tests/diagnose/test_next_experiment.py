@@ -81,6 +81,7 @@ def undecided_between(known, searched, hypotheses, verdict="ambiguous"):
         posterior=SimpleNamespace(hypotheses=dict.fromkeys(hypotheses, share), something=share),
         decision=SimpleNamespace(verdict=verdict),
         law=None,
+        asked={},
     )
 
 
@@ -93,8 +94,7 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
-    near, _ = propose(found)  # no limits given: not beyond what was recorded, and there they look alike
-    assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
+    assert propose(found) is None  # no limits given: not beyond what was recorded, and there they look alike
 
 
 HOT_END = BELIEF.replace("heat: {unit: W}", "heat: {unit: W}, fan: {unit: '1'}").replace(
@@ -183,6 +183,15 @@ def test_where_an_effect_is_likelier_than_none_an_experiment_tells_it_from_the_p
     entry, _ = propose(perhaps, limits=LIMITS)
     assert [x["hypothesis"] for x in entry["separates"]] == ["the plant as it is"]
     assert entry["separates"][0]["from"] == "radiation at T" and entry["separates"][0]["sigmas"] > 3
+
+
+def test_what_nothing_else_confirms_is_told_from_the_plant_as_it_is(undecided):
+    radiation = next(k for k in undecided.posterior.hypotheses if ("radiation", "T") in k)
+    refused = undecided_between(undecided.case, undecided.searched, [radiation], "unexplained")
+    assert propose(refused, limits=LIMITS) is None  # one hypothesis, and no doubt
+    refused.asked = dict.fromkeys(radiation, 0.6)
+    entry, _ = propose(refused, limits=LIMITS)
+    assert [x["hypothesis"] for x in entry["separates"]] == ["the plant as it is"] and entry["bits"] > 0.5
 
 
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):

@@ -54,6 +54,7 @@ DECIDES = 20.0  # D that decides: mean odds of e^(D/2) for one of two
 IN_RANGE = (
     0.09  # variance of a parameter that is new in every recording: anything within its range (z from 0 to 1)
 )
+WORTH_RIG_TIME = 0.06  # bits, below which an experiment is not proposed
 WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
 
 Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
@@ -162,21 +163,27 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
 
 
 def survivors(found: Diagnosis) -> list[Standing]:
-    """List what is not ruled out, likeliest first: hypotheses with effects, or laws of the remainder.
+    """List what is not ruled out, likeliest first: hypotheses, or laws of the remainder.
 
-    Where the recordings agree with the plant and yet an effect is likelier than none, the plant as it is
-    counts, too. Each has its probability and its name. The list is empty where nothing is undecided."""
-    perhaps = found.decision.verdict == "consistent" and found.posterior.something > 0.5
-    if found.decision.verdict == "ambiguous" or perhaps:
-        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
-        likely = [(fits[k], p, _effects(k)) for k, p in found.posterior.hypotheses.items() if k or perhaps]
-    elif found.law:
+    Where no effect is named although one is likelier than none, the plant as it is counts, too; where nothing
+    else confirms an effect, by the chance that this leaves. Each has its probability and its name. The list
+    is empty where nothing is undecided."""
+    verdict, hypotheses = found.decision.verdict, dict(found.posterior.hypotheses)
+    if verdict == "ambiguous" or (verdict == "consistent" and found.posterior.something > 0.5):
+        hypotheses = {k: p for k, p in hypotheses.items() if k or verdict == "consistent"}
+    elif verdict == "unexplained":
+        doubt = 1.0 - min(found.asked.values(), default=1.0)
+        hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
+    elif not found.law:
+        return []
+    if found.law:
         likely = [
             (f, share, described(p, f))
             for p, f, share in ((found.law.proposal, found.law.fitted, found.law.share), *found.law.rivals)
         ]
     else:
-        return []
+        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+        likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
     likely.sort(key=lambda x: -x[1])
     return [x for x in likely if x[1] >= LIKELY * likely[0][1] and x[1] > 0][:MOST]
 
@@ -266,7 +273,7 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where nothing is undecided (`survivors`) or nothing can be driven.
+    None where nothing is undecided (`survivors`), nothing can be driven, or no experiment tells enough.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:
@@ -292,6 +299,8 @@ def propose(
             trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
         if trials:
             most = max(t.bits for t in trials)
+            if most < WORTH_RIG_TIME:
+                return None
             best = max((t for t in trials if t.bits >= ENOUGH * most), key=lambda t: t.bits_per_second)
             return _entry(comparison, best, len(trials)), best.excitation
     return None
