@@ -23,6 +23,7 @@ from thermoctl.diagnosis.search.beam import Keys, Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Posterior, decide, weigh
+from thermoctl.diagnosis.verdict.families import families
 from thermoctl.diagnosis.verdict.misfit import energies, standing, supported
 from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
@@ -148,6 +149,7 @@ def _decided(sought: Sought) -> Diagnosis:
         physics,
         doubt,
         asked,
+        families=families(posterior, physics, decision.named, known.catalogue, asked, numbers.name),
         law=_law(known, tried, best, decision, posterior, asked),
     )
 

@@ -23,6 +23,7 @@ from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.search.beam import Searched
 from thermoctl.diagnosis.verdict.decide import Decision, Posterior
+from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
@@ -53,6 +54,7 @@ class Diagnosis:
       probability of being physics
     - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
     - `asked`: probability that an effect predicts what it was not fitted to, of those that would be named
+    - `families`: effects that imitate each other, one of which is sure
     - `missing_flow`: rms of the flow into `before.node` that would close the misfit, where nothing is shown
     - `law`: a law among the findings"""
 
@@ -69,6 +71,7 @@ class Diagnosis:
     physics: Mapping[frozenset[Key], Mapping[Key, float]]
     unknown: str
     asked: Mapping[Key, float]
+    families: tuple[Family, ...] = ()
     missing_flow: float | None = None
     law: Law | None = None
 
@@ -142,6 +145,16 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 for (e, w), p in d.decision.alternatives
                 if (e, w) not in keys
             ],
+            "families": [
+                {
+                    "effects": [
+                        {"effect": e, "where": w, "probability": round(d.posterior.effects[e, w], 4)}
+                        for e, w in f.members
+                    ],
+                    "probability": round(f.probability, 4),
+                }
+                for f in d.families
+            ],
             "mismatch": _mismatch(d),
             "remainder": {
                 "share_closed": d.worth.share_closed if d.extends else 0.0,
@@ -197,6 +210,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
         *filter(None, [d.unknown]),
+        *map(_one_of, d.families),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "
             f"{chance(d.posterior.effects.get((effect, where), 0.0))})"
@@ -204,6 +218,13 @@ def _notes(d: Diagnosis) -> list[str]:
         ),
         *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
     ]
+
+
+def _one_of(family: Family) -> str:
+    """Return a sentence that says what is sure of effects that imitate each other."""
+    return "one of these is there for sure, and the recordings do not tell which: " + ", ".join(
+        f"{e} at {w}" for e, w in family.members
+    )
 
 
 def unfinished(*fits: Fitted) -> list[str]:

@@ -165,9 +165,9 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
 def survivors(found: Diagnosis) -> list[Standing]:
     """List what is not ruled out, likeliest first: hypotheses, or laws of the remainder.
 
-    Where no effect is named although one is likelier than none, the plant as it is counts, too; where nothing
-    else confirms an effect, by the chance that this leaves. Each has its probability and its name. The list
-    is empty where nothing is undecided."""
+    Where no effect is named although one is likelier than none, the plant as it is counts, too. Where nothing
+    else confirms an effect, it counts by the chance that this leaves. Each has its probability and its name.
+    The list is empty where nothing is undecided."""
     verdict, hypotheses = found.decision.verdict, dict(found.posterior.hypotheses)
     if verdict == "ambiguous" or (verdict == "consistent" and found.posterior.something > 0.5):
         hypotheses = {k: p for k, p in hypotheses.items() if k or verdict == "consistent"}
