@@ -11,10 +11,10 @@ from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Conversion
 from thermoctl.plant.recordings import as_recorded, in_plant_units, read_recordings
 from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.units import conversion
 from thermoctl.recording.files import read_table
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
+from thermoctl.units import conversion
 from thermoctl.yamlfile import InputError
 
 T = np.arange(0.0, 400.0, 2.0)

@@ -19,8 +19,9 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, OWN, _read
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import Plant, expression, load
 from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.units import check_units, dimension
+from thermoctl.plant.units import check_units
 from thermoctl.shipped import shipped
+from thermoctl.units import dimension
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 
 SYMBOLS: Mapping[str, tuple[str, ...]] = {

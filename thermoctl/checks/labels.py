@@ -28,9 +28,9 @@ from thermoctl.checks.model import NYQUIST, rates_of
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
-from thermoctl.plant.units import conversion, dimension
 from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
+from thermoctl.units import conversion, dimension
 
 RARITY = 1000.0  # prior odds against a wrong label
 CLOSE = 2.0  # residual over noise below which nothing is left to explain by labels

@@ -11,7 +11,6 @@ The dataclasses below are the table; `options()` lists it for the reference page
 from __future__ import annotations
 
 import dataclasses
-import functools
 import re
 import types
 import typing
@@ -35,6 +34,7 @@ from thermoctl.rig.channels import (
 )
 from thermoctl.rig.option import Option, option
 from thermoctl.rig.signals import Row, of_channels
+from thermoctl.units import conversion, ratio
 from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
@@ -632,53 +632,22 @@ def _number(node: Node, label: str, row: Option, whole: bool = False) -> float:
     return int(value) if whole else value
 
 
-_SIZES = {  # of common units, without pint: by symbol the kind and the size in the kind's base unit
-    symbol: (kind, Fraction(size))
-    for kind, sizes in {
-        "s": "s 1 ms 1/1000 us 1/1000000 min 60 h 3600",
-        "m": "m 1 mm 1/1000 um 1/1000000 nm 1/1000000000",
-        "A": "A 1 mA 1/1000",
-        "V": "V 1 mV 1/1000",
-        "W": "W 1 mW 1/1000 kW 1000",
-        "Hz": "Hz 1 kHz 1000",
-    }.items()
-    for symbol, size in zip(sizes.split()[::2], sizes.split()[1::2], strict=True)
-}
-
-
-def _ratio(given: str, unit: str) -> Fraction | None:
-    """Return the size of a unit in another one, `mm/min` included; None where pint has to tell."""
-    ratio = Fraction(1)
-    ours, theirs = unit.split("/"), given.split("/")
-    for power, one, other in zip((1, -1), theirs, ours, strict=False):
-        (kind, size), (wanted, per) = _SIZES.get(one, ("?", ratio)), _SIZES.get(other, ("!", ratio))
-        if kind != wanted:
-            return None
-        ratio *= (size / per) ** power
-    return ratio if len(ours) == len(theirs) <= 2 else None
-
-
 def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
     """Convert text such as '5 ms' to the option's unit."""
     number, _, given = text.strip().partition(" ")
     try:
-        if (ratio := _ratio(given, unit)) is not None:
-            return float(Fraction(number) * ratio)
-        return float(_unit_registry().Quantity(float(number), given).to(unit).magnitude)
-    except ValueError:
+        value = Fraction(number)
+    except (ValueError, ZeroDivisionError):
         raise node.error(f"{label}: a number in {unit or 'no unit'} was expected, not '{text}'") from None
-    except Exception as e:  # pint's errors have no common base but Exception
+    try:
+        if (factor := ratio(given, unit)) is not None:
+            return float(value * factor)
+        scale, offset = conversion(given, unit or "1")
+        return scale * float(value) + offset
+    except ValueError as e:
         raise node.error(
-            f"{label}: '{text}': the unit does not fit ({str(e).splitlines()[0]}); expected {unit or 'no unit'}"
+            f"{label}: '{text}': the unit does not fit ({e}); expected {unit or 'no unit'}"
         ) from None
-
-
-@functools.cache
-def _unit_registry() -> Any:
-    """Return pint's units; importing it takes longer than reading the configuration."""
-    import pint
-
-    return pint.UnitRegistry()
 
 
 def _texts(mapping: Section) -> dict[str, str]:

@@ -22,8 +22,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.build import compiler
 from thermoctl.plant.equations import Equations
 from thermoctl.plant.language import Plant
-from thermoctl.plant.units import conversion, dimension
 from thermoctl.safe_file import whole_file
+from thermoctl.units import conversion, dimension
 from thermoctl.yamlfile import InputError
 
 _PLATFORM = {"linux": ("linux64", ".so"), "darwin": ("darwin64", ".dylib")}

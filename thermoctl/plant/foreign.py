@@ -18,7 +18,7 @@ import numpy as np
 from thermoctl.plant.fmu import Fmu, Variable, opened
 from thermoctl.plant.language import FORMAT
 from thermoctl.plant.parse import RESERVED
-from thermoctl.plant.units import dimension
+from thermoctl.units import dimension
 from thermoctl.yamlfile import Node, suggest
 
 SECTIONS = ("title", "inputs", "states", "outputs", "parameters")

@@ -13,10 +13,10 @@ import numpy as np
 
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.plant.parts import all_parts
-from thermoctl.plant.units import conversion
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
 from thermoctl.recording.units import split_unit
+from thermoctl.units import conversion
 from thermoctl.yamlfile import InputError
 
 

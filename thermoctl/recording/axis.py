@@ -17,7 +17,8 @@ import pyarrow.compute as pc
 from thermoctl.recording import clock
 from thermoctl.recording.clock import ClockError, Seconds
 from thermoctl.recording.sheet import Cells, Sheet
-from thermoctl.recording.units import SECONDS, WORDS, known, spelled
+from thermoctl.recording.units import WORDS, known, spelled
+from thermoctl.units import SECONDS
 
 KINDS = {
     "date and time": 60,

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from thermoctl.recording.units import SECONDS
+from thermoctl.units import SECONDS
 
 DAY_NS = 86_400_000_000_000
 DAY_S = 86_400.0

@@ -17,7 +17,8 @@ from pathlib import Path
 from thermoctl.recording.axis import is_generic, named
 from thermoctl.recording.cells import is_missing, is_number
 from thermoctl.recording.clock import is_time
-from thermoctl.recording.units import SECONDS, WORDS, known, spelled, split_unit, split_words
+from thermoctl.recording.units import WORDS, known, spelled, split_unit, split_words
+from thermoctl.units import SECONDS
 from thermoctl.yamlfile import InputError
 
 SAMPLE = 400  # lines that decide

@@ -8,59 +8,23 @@ from typing import Any
 
 import yaml
 
+from thermoctl.units import conversion, dimension, ratio
+
 WORDS: dict[str, Any] = yaml.load(
     Path(__file__).with_name("words.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 )
 """Words that loggers use, by kind."""
 # Symbols that make `(...)` behind a name a unit; square brackets always hold one.
-_PREFIX = {
-    "": 1.0,
-    "p": 1e-12,
-    "n": 1e-9,
-    "u": 1e-6,
-    "µ": 1e-6,
-    "m": 1e-3,
-    "c": 1e-2,
-    "d": 1e-1,
-    "da": 1e1,
-    "h": 1e2,
-}
-_PREFIX |= {"k": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
-_BASE: tuple[str, ...] = (
-    "m",
-    "g",
-    "s",
-    "A",
-    "K",
-    "V",
-    "W",
-    "J",
-    "N",
-    "Pa",
-    "Hz",
-    "ohm",
-    "F",
-    "H",
-    "C",
-    "T",
-    "Wh",
-    "l",
-    "L",
-    "mol",
-    "bar",
-)
-_BASE = (*_BASE, "VA", "var", "S", "Nm", "eV", "Wb", "lx", "rad", "Ah")
 _SYMBOL = (
     r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|rpm|rps|kn|dBm|dB|"
     r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|eV|Wb|lx|rad|Ah))"
 )
+ANGLES = (), dimension("Hz")  # of these pint takes a radian for 1, and a turn for 2 pi
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
 _UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
 _LAST = re.compile(r"(.*[^\s,(\[/])\s+(°\s?[CF]|℃|℉)$|(CH\d+)([VA])$")  # `Temp. °C`; CH1V of an oscilloscope
 _SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
-"""Seconds of a unit of time."""
 
 
 def spelled(unit: str | None, name: str = "") -> str | None:
@@ -116,16 +80,15 @@ def split_words(header: str) -> tuple[str, str | None]:
 
 
 def scale_between(unit: str | None, other: str | None) -> float | None:
-    """Return the factor from one unit to another of the same base; None if there is none."""
+    """Return the factor from one unit to another of the same dimension; None if there is none."""
     if unit == other:
         return 1.0
-    if unit in SECONDS and other in SECONDS:
-        return SECONDS[unit] / SECONDS[other]
-    a, b = _parts(unit), _parts(other)
-    return _PREFIX[a[0]] / _PREFIX[b[0]] if a and b and a[1] == b[1] else None
-
-
-def _parts(unit: str | None) -> tuple[str, str] | None:
-    """Return SI prefix and base of a unit; None for another."""
-    found = sorted((p, b) for b in _BASE for p in _PREFIX if p + b == unit)
-    return found[0] if found else None
+    if (factor := ratio(unit or "", other or "")) is not None:
+        return float(factor)
+    try:
+        if dimension(unit or "") in ANGLES:
+            return None
+        scale, offset = conversion(unit or "", other or "")
+    except ValueError:
+        return None
+    return scale if offset == 0.0 else None

@@ -15,8 +15,8 @@ import numpy as np
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.units import dimension
 from thermoctl.recording.table import Table
+from thermoctl.units import dimension
 from thermoctl.yamlfile import InputError
 
 TOGETHER = 0.98  # correlation from which two inputs count as one lever (voltage and current)

@@ -12,7 +12,7 @@ import numpy as np
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.units import dimension
+from thermoctl.units import dimension
 
 SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
 STRAIGHT = "_straight"  # of the name of an input that holds, where it goes on straight lines

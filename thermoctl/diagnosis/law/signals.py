@@ -11,7 +11,7 @@ from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, zero_of
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
-from thermoctl.plant.units import conversion, dimension
+from thermoctl.units import conversion, dimension
 
 QUANTILES = 21  # of a signal: each 5 %
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.plant.units import conversion, dimension
 from thermoctl.recording.table import Table
+from thermoctl.units import conversion, dimension
 from thermoctl.yamlfile import InputError
 
 UNITS = {

@@ -10,9 +10,9 @@ from thermoctl.plant.files import loads
 from thermoctl.plant.first.columns import UNITS, Column, quoted, words
 from thermoctl.plant.first.thermal import confirm
 from thermoctl.plant.language import Input, Output, Plant
-from thermoctl.plant.units import dimension
 from thermoctl.recording.table import Table
 from thermoctl.shipped import shipped
+from thermoctl.units import dimension
 from thermoctl.yamlfile import InputError, suggest
 
 TEMPLATES = ("block", "motor", "hot-end", "room", "tank", "stage", "flexure", "actuator")

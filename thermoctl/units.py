@@ -1,0 +1,241 @@
+"""Units: the dimension of a unit as text, and the factor from one to another.
+
+    dimension("kW/m^2")        (("kg", 1), ("s", -3))
+    conversion("degF", "K")    (5/9, 255.37): K = 5/9 degF + 255.37
+
+The one table of units for options, plants, recordings and columns. Its symbols need no pint, whose import takes half a second.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+Dimension = tuple[tuple[str, Fraction], ...]
+"""Sorted (base unit, exponent) pairs; () is dimensionless. None stands for 'fits anywhere'."""
+
+_COMMON = {  # dimension: its symbols, each with its size in SI units; 0: pint has it
+    "": "1 1 dimensionless 1 rad 1 mrad 1/1000 urad 1e-6 deg 0 % 1/100 percent 1/100",
+    "m": "m 1 cm 1/100 mm 1/1000 um 1e-6 µm 1e-6 nm 1e-9",
+    "kg": "kg 1 g 1/1000",
+    "s": "s 1 ms 1/1000 us 1e-6 ns 1e-9 min 60 h 3600 d 86400",
+    "A": "A 1 mA 1/1000",
+    "K": "K 1 mK 1/1000 delta_degC 1 degC 0 degF 0",
+    "s-1": "Hz 1 mHz 1/1000 kHz 1000 MHz 1000000 GHz 1e9",
+    "kg m s-2": "N 1 mN 1/1000 kN 1000",
+    "kg m-1 s-2": "Pa 1 kPa 1000 bar 100000",
+    "kg m2 s-2": "J 1 kJ 1000 Wh 3600 kWh 3600000",
+    "kg m2 s-3": "W 1 mW 1/1000 kW 1000 MW 1000000 VA 1 kVA 1000 var 1 kvar 1000",
+    "kg m2 s-3 A-1": "V 1 mV 1/1000 kV 1000",
+    "kg m2 s-3 A-2": "ohm 1 mohm 1/1000",
+    "kg m2 s-2 A-2": "H 1 mH 1/1000",
+    "kg-1 m-2 s4 A2": "F 1",
+    "s A": "C 1",
+    "kg s-2 A-1": "T 1",
+    "kg m2 s-2 A-1": "Wb 1",
+}
+SYMBOLS = {
+    symbol: (of, Fraction(size))
+    for of, symbols in _COMMON.items()
+    for symbol, size in zip(symbols.split()[::2], symbols.split()[1::2], strict=True)
+}
+"""Symbol: (dimension as text, size in SI units, 0 where only pint has it)."""
+SECONDS = {symbol: float(size) for symbol, (of, size) in SYMBOLS.items() if of == "s"}
+"""Seconds of a unit of time."""
+_KELVIN = {
+    "K": (1.0, 0.0),
+    "degC": (1.0, 273.15),
+    "degF": (5 / 9, 459.67 * 5 / 9),
+}  # scale, offset to kelvins
+_BASES = {
+    "[length]": "m",
+    "[mass]": "kg",
+    "[time]": "s",
+    "[current]": "A",
+    "[temperature]": "K",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
+}
+_TOKEN = re.compile(
+    r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|"
+    r"(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)|(?P<symbol>[^\W\d]\w*|%|°C|°))"
+)
+_RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+_WRITTEN = {"kg m2 s-2": "J", "kg m2 s-3": "W", "kg m s-2": "N", "kg m2 s-3 A-1": "V", "kg m2 s-3 A-2": "ohm"}
+_MAX_LENGTH, _MAX_EXPONENT = 100, 100
+
+
+@cache
+def dimension(unit: str) -> Dimension:
+    """Return the dimension of a unit as pint writes it: 'W/K', 'kW/m^2', 'V**0.5/s', '%', 'N*s/m'.
+
+    Raises ValueError."""
+    if len(unit) > _MAX_LENGTH:
+        raise ValueError(f"'{unit[:20]}...' is longer than {_MAX_LENGTH} letters")
+    tokens, at = [], 0
+    text = unit.strip()
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if not match:
+            raise ValueError(
+                f"'{unit}' is not a unit: '{text[at]}' was not expected; one such as W/K or N*s/m was"
+            )
+        tokens.append((match.lastgroup or "", match[match.lastgroup or 0]))
+        at = match.end()
+    try:
+        result, rest = _product(tokens, 0)
+    except IndexError:
+        raise ValueError(f"'{unit}' is not a unit: it ends too early") from None
+    except ValueError as error:
+        raise ValueError(f"'{unit}' is not a unit: {error}") from None
+    if rest != len(tokens):
+        raise ValueError(f"'{unit}' is not a unit: '{tokens[rest][1]}' was not expected")
+    return result
+
+
+def conversion(given: str, wanted: str) -> tuple[float, float]:
+    """Return (scale, offset) from a unit to another: wanted = scale * given + offset. Raises ValueError.
+
+    C and F are degrees where a temperature is wanted."""
+    if dimension(wanted) == dimension("K"):
+        given = {"C": "degC", "F": "degF"}.get(given, given)
+    if dimension(given) != dimension(wanted):
+        raise ValueError(
+            f"{given} [{described(dimension(given))}] is no {wanted} [{described(dimension(wanted))}]"
+        )
+    if given == wanted:
+        return 1.0, 0.0
+    if given in _KELVIN and wanted in _KELVIN:
+        (a, b), (c, d) = _KELVIN[given], _KELVIN[wanted]
+        return a / c, (b - d) / c
+    if (factor := ratio(given, wanted)) is not None:
+        return float(factor), 0.0
+    registry = _registry()
+    ends = [float(registry.Quantity(x, _spelled(given)).to(_spelled(wanted)).magnitude) for x in (0.0, 1.0)]
+    return ends[1] - ends[0], ends[0]
+
+
+def ratio(given: str, wanted: str) -> Fraction | None:
+    """Return the size of a common unit in another one, `mm/min` included; None where pint has to tell."""
+    factor = Fraction(1)
+    ours, theirs = wanted.split("/"), given.split("/")
+    for power, one, other in zip((1, -1), theirs, ours, strict=False):
+        (kind, size), (of, per) = SYMBOLS.get(one, ("?", 0)), SYMBOLS.get(other, ("!", 0))
+        if kind != of or not size or not per:
+            return None
+        factor *= (Fraction(size) / per) ** power
+    return factor if len(ours) == len(theirs) <= 2 else None
+
+
+def _spelled(unit: str) -> str:
+    plain = unit.replace("°C", "degC").replace("°", "deg").translate(_RAISED)
+    return "dimensionless" if plain == "1" else plain
+
+
+Tokens = list[tuple[str, str]]
+
+
+def _product(tokens: Tokens, at: int) -> tuple[Dimension, int]:
+    total, at = _factor(tokens, at)
+    while at < len(tokens) and tokens[at][1] != ")":
+        sign = -1 if tokens[at][1] == "/" else 1
+        if tokens[at][0] == "op" and tokens[at][1] != "(":
+            at += 1
+        factor, at = _factor(tokens, at)
+        total = times(total, factor, sign)
+    return total, at
+
+
+def _factor(tokens: Tokens, at: int) -> tuple[Dimension, int]:
+    kind, text = tokens[at]
+    at += 1
+    if text == "(":
+        base, at = _product(tokens, at)
+        if tokens[at][1] != ")":
+            raise ValueError("')' was expected")
+        at += 1
+    elif kind == "symbol":
+        base = _symbol(text)
+    elif kind == "number" and text[0] not in "+-":
+        base = ()
+    else:
+        raise ValueError(f"'{text}' was not expected")
+    if at < len(tokens) and tokens[at][0] == "raised":
+        return raised(base, float(tokens[at][1].translate(_RAISED))), at + 1
+    if at < len(tokens) and tokens[at][0] == "power":
+        at += 1
+        closing = tokens[at][1] == "("
+        at += closing
+        if tokens[at][0] != "number":
+            raise ValueError(f"the exponent '{tokens[at][1]}' is not a number")
+        base = raised(base, float(tokens[at][1]))
+        at += 1
+        if closing:
+            if tokens[at][1] != ")":
+                raise ValueError("')' was expected")
+            at += 1
+    return base, at
+
+
+@cache
+def _symbol(symbol: str) -> Dimension:
+    if symbol in SYMBOLS:
+        pairs = re.findall(r"([A-Za-z]+)(-?\d*)", SYMBOLS[symbol][0])
+        return tuple(sorted((base, Fraction(int(power or 1))) for base, power in pairs))
+    lookup, undefined = _pint()
+    try:
+        found = lookup(symbol.replace("°C", "degC").replace("°", "deg"))
+    except undefined:
+        raise ValueError(f"pint knows no unit '{symbol}'") from None
+    if not set(found) <= set(_BASES):
+        raise ValueError(f"'{symbol}' is no unit of physics that a plant may use")
+    return tuple(
+        sorted(
+            (_BASES[key], Fraction(power).limit_denominator(10_000)) for key, power in found.items() if power
+        )
+    )
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+@cache
+def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], ...]]:
+    import pint
+
+    return _registry().get_dimensionality, (
+        pint.errors.UndefinedUnitError,
+        pint.errors.DefinitionSyntaxError,
+        AttributeError,
+    )
+
+
+def times(a: Dimension, b: Dimension, sign: int = 1) -> Dimension:
+    total = dict(a)
+    for base, exponent in b:
+        total[base] = total.get(base, Fraction(0)) + sign * exponent
+    return tuple(sorted((base, exponent) for base, exponent in total.items() if exponent))
+
+
+def raised(base: Dimension, exponent: float) -> Dimension:
+    if not abs(exponent) <= _MAX_EXPONENT:
+        raise ValueError(f"the exponent {exponent:g} is beyond {_MAX_EXPONENT}")
+    k = Fraction(exponent).limit_denominator(10_000)
+    return tuple((name, q) for name, power in base if (q := (power * k).limit_denominator(10_000)))
+
+
+def described(d: Dimension) -> str:
+    """Return text such as kg m2 s-3, with the derived unit if there is one."""
+    order = {b: i for i, b in enumerate(_BASES.values())}
+    written = " ".join(
+        f"{base}{'' if q == 1 else q if q.denominator == 1 else f'^({q})'}"
+        for base, q in sorted(d, key=lambda pair: (pair[0] != "kg", order.get(pair[0], 99)))
+    )
+    return f"{_WRITTEN[written]} = {written}" if written in _WRITTEN else written or "dimensionless"
