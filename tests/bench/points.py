@@ -23,7 +23,7 @@ import numpy as np
 from tests.bench.realtime.run import law_numbers
 from thermoctl.control.law import COMPILED, Law
 from thermoctl.control.model import CompensatorModel, Parameters
-from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.loop import Axis
 from thermoctl.daemon.tick.ring import Ring
 from thermoctl.rig.channels import AT, COIL, DEFAULT, Channels, Point, of_points
 from thermoctl.rig.signals import OUTPUTS, of_channels
@@ -89,7 +89,7 @@ def microseconds(points: int, axes: int = 1) -> float:
     for _ in range(axes):
         ring = Ring(np.zeros(1, np.uint64), np.zeros((8192, len(of_channels(channels)))))
         limits = parameters_of(COIL + points)
-        rigs.append(Rig(Prepared(channels), model(points), limits, 1e-3, ring, channels=channels))
+        rigs.append(Axis(Prepared(channels), model(points), limits, 1e-3, ring, channels=channels))
     for rig in rigs:
         rig.guards = [other for other in rigs if other is not rig]
     best = np.inf

@@ -1,6 +1,6 @@
 """What axes of a rig have in common, as scenarios: a fault of one disarms another or not, a sensor of all reaches all.
 
-Each takes the code: `Rig` of loop.py, `guard` of processes.py, `AxisBackend` of hal/thermoctl_hal/rig/axes.py, and channels.py. The tests run them on
+Each takes the code: `Axis` of loop.py, `guard` of processes.py, `AxisBackend` of axes.py of hal, and channels.py. The tests run them on
 the product, mutants.py on every small change of MUTATED.
 """
 
@@ -50,7 +50,7 @@ def build(trees: dict[str, ast.Module]) -> SimpleNamespace:
         )
         made[path.stem] = module
     return SimpleNamespace(
-        Rig=made["loop"].Rig,
+        Axis=made["loop"].Axis,
         guard=made["processes"].guard,
         AxisBackend=made["axes"].AxisBackend,
         channels=made["channels"],
@@ -58,7 +58,7 @@ def build(trees: dict[str, ast.Module]) -> SimpleNamespace:
 
 
 PRODUCT = SimpleNamespace(
-    Rig=loop.Rig, guard=processes.guard, AxisBackend=thermoctl_hal.rig.axes.AxisBackend, channels=channels
+    Axis=loop.Axis, guard=processes.guard, AxisBackend=thermoctl_hal.rig.axes.AxisBackend, channels=channels
 )
 
 
@@ -101,7 +101,7 @@ class Bench:
         points = channels.of_points([channels.Point("coil", role="coil")])
         self.stills = [Still() for _ in policy]
         self.rigs = [
-            code.Rig(
+            code.Axis(
                 still,
                 zero_model(PERIOD_S, ("coil",)),
                 parameters,

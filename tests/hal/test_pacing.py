@@ -20,7 +20,7 @@ from thermoctl.daemon.answers.display import counter_lines
 from thermoctl.daemon.command_server import Commands
 from thermoctl.daemon.tick.arrival import device_counters, put_counters, slow_readings
 from thermoctl.daemon.tick.clock import now_ns
-from thermoctl.daemon.tick.loop import Rig, run_loop
+from thermoctl.daemon.tick.loop import Axis, run_loop
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.signals import AT, INDEX
 from thermoctl.yamlfile import InputError
@@ -87,7 +87,7 @@ def test_ticks_follow_the_frames_and_go_on_without_them(encoder):
     shared = Shared.create(f"thermoctl-pace-{os.getpid()}")
     settings = SimpleNamespace(loop=SimpleNamespace(period_s=PERIOD_S, spin_s=0.0, pace="device"))
     parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0, **OFF)
-    rig = Rig(encoder.backend, zero_model(), parameters, PERIOD_S, shared.ring, start_s=time.monotonic())
+    rig = Axis(encoder.backend, zero_model(), parameters, PERIOD_S, shared.ring, start_s=time.monotonic())
     muted, done = threading.Event(), threading.Event()
 
     def feed():
@@ -122,7 +122,7 @@ def test_status_has_the_counters_of_the_devices(encoder):
     shared = Shared.create(f"thermoctl-counters-{os.getpid()}")
     settings = SimpleNamespace(loop=SimpleNamespace(period_s=0.001, spin_s=0.0, pace="clock"))
     parameters = Parameters(kp=0.01, ti_s=0.01, td_s=0.0, output_limit=1.0, **OFF)
-    rig = Rig(encoder.backend, zero_model(), parameters, 0.001, shared.ring, start_s=time.monotonic())
+    rig = Axis(encoder.backend, zero_model(), parameters, 0.001, shared.ring, start_s=time.monotonic())
     good = encoder.frame()
     os.write(encoder.master, good + good[:-1] + bytes([good[-1] ^ 1]) + encoder.frame())
     try:

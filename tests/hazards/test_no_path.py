@@ -12,7 +12,7 @@ from tests.limits import OFF
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
-from thermoctl.daemon.tick.loop import RELOAD, Rig
+from thermoctl.daemon.tick.loop import RELOAD, Axis
 from thermoctl.daemon.tick.ring import Box, Mailbox
 from thermoctl.rig.signals import INDEX
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sample
@@ -128,7 +128,7 @@ class NoPath(RuleBasedStateMachine):
             Mailbox(np.zeros(2, np.uint64), np.zeros((4, 2))),
             Box(np.zeros(1, np.uint64), np.zeros(packed_length(len(ROLES)) + 1)),
         )
-        self.rig = Rig(self.stage, model(), parameters(), PERIOD_S, lambda row: None, self.mail, self.box)
+        self.rig = Axis(self.stage, model(), parameters(), PERIOD_S, lambda row: None, self.mail, self.box)
         self.rig.wall_s = lambda: 0.0
         self.now_s, self.before = 0.0, arming.OFF
         if warm:

@@ -8,7 +8,7 @@ import numpy as np
 
 from thermoctl.daemon.command_server import Commands, listen, serve
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
-from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.loop import Axis
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.rig.signals import INDEX
 from thermoctl_hal.base.backend import ERROR, OK, ROLE
@@ -47,7 +47,7 @@ class Running:
         backend = make_backend(settings)
         backend.open()
         self.backend = Spoilt(backend)
-        self.rig = Rig(
+        self.rig = Axis(
             self.backend,
             compensator(settings),
             law_parameters(settings),

@@ -14,7 +14,7 @@ from thermoctl.control import arming, faults
 from thermoctl.daemon.offline.simulate import COMMANDS
 from thermoctl.daemon.processes import guard
 from thermoctl.daemon.tick.assemble import compensator, law_parameters
-from thermoctl.daemon.tick.loop import Rig
+from thermoctl.daemon.tick.loop import Axis
 from thermoctl.daemon.tick.ring import Mailbox
 from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.rig.make import make_backends
@@ -68,7 +68,7 @@ class Axes:
         self.backends = backends or make_backends(settings)
         self.parts, self.now_s, self.period_s = settings.parts, 0.0, settings.loop.period_s
         self.rigs = [
-            Rig(
+            Axis(
                 b,
                 compensator(p),
                 law_parameters(p),

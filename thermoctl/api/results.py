@@ -88,7 +88,7 @@ def joined(
 
 
 @dataclass(frozen=True)
-class Finding:
+class FoundEffect:
     """One effect that the plant lacks.
 
     `confirmed`: probability that it predicts what it was not fitted to. `parameters`: value, sd and unit by
@@ -122,9 +122,9 @@ class Diagnosis:
         return str(self.json["verdict"])
 
     @property
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[FoundEffect]:
         """The effects that the plant lacks, each with its own probability."""
-        return [Finding(**f) for f in self.json["findings"]]
+        return [FoundEffect(**f) for f in self.json["findings"]]
 
     @property
     def summary(self) -> str:

@@ -90,9 +90,9 @@ def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
     return EXIT_OK
 
 
-def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -> loops.Rig:
+def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -> loops.Axis:
     """Make the rig of one axis, with the estimates of the previous run where they are recent."""
-    rig = loops.Rig(
+    rig = loops.Axis(
         backend,
         compensator(settings),
         law_parameters(settings),
@@ -110,14 +110,14 @@ def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -
     return rig
 
 
-def guard(rigs: list[loops.Rig], parts: Sequence[Settings]) -> None:
+def guard(rigs: list[loops.Axis], parts: Sequence[Settings]) -> None:
     """Let each axis with `on_other_axis_fault: disarm` watch the others."""
     for rig, settings in zip(rigs, parts, strict=True):
         if settings.protection.on_other_axis_fault == "disarm":
             rig.guards = [other for other in rigs if other is not rig]
 
 
-def _resume(settings: Settings, shared: Shared, rig: loops.Rig) -> None:
+def _resume(settings: Settings, shared: Shared, rig: loops.Axis) -> None:
     """Restore the previous run's estimates, when they are recent and of this model."""
     state, age_s, why = keep.load(keep.kept_path(settings), rig.law.model)
     if state is not None:

@@ -126,14 +126,6 @@ cdef extern from *:
     double rls_c(double* theta, double* q, const double* f, double y, double lam, double* g, long n) noexcept nogil
 
 
-def rls_step(double[::1] theta, double[:, ::1] q, double[::1] f, double y, double lam, double[::1] work):
-    """Do one step of (5) in place: theta (p,), q (p, p), regressor f (p,), work (p,).
-
-    Return the prediction error.
-    """
-    return rls_c(&theta[0], &q[0, 0], &f[0], y, lam, &work[0], theta.shape[0])
-
-
 def rls_run(double[::1] theta, double[:, ::1] q, double[:, ::1] f, double[::1] y, double lam):
     """Run (5) over all rows of f (N, p), y (N,), in place; return the prediction errors (N,)."""
     cdef Py_ssize_t N = f.shape[0], k, n = theta.shape[0]

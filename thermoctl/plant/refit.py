@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thermoctl.plant.climb import Climbed, Spot, climb
-from thermoctl.plant.residuals import Evaluation, Prior, Problem, Rows
+from thermoctl.plant.residuals import Evaluation, Prior, Problem, ResidualRows
 from thermoctl.plant.simulate import Excitation, Model, SimulationError
 from thermoctl.plant.whitening import Noise, default_noise
 
@@ -173,7 +173,7 @@ def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
     )
 
 
-Found = tuple[Evaluation, list[Rows] | None]  # rows only where slopes were computed
+Found = tuple[Evaluation, list[ResidualRows] | None]  # rows only where slopes were computed
 
 
 class _Misfit:
@@ -184,11 +184,11 @@ class _Misfit:
         n, states = problem.n_parameters, len(problem.unknowns) - problem.n_parameters
         shift = np.full(states, MAX_SHIFT)
         self.bounds = np.append(np.zeros(n), -shift), np.append(np.ones(n), shift)
-        self.rows: list[Rows] = []  # where the climb stands
+        self.rows: list[ResidualRows] = []  # where the climb stands
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[Found]:
         """Evaluate the cost."""
-        rows: list[Rows] = []
+        rows: list[ResidualRows] = []
         found = self.problem.evaluate(z, slopes, rows)
         return Spot(z, -0.5 * found.cost, (found, rows if slopes else None))
 

@@ -76,7 +76,7 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Rows:
+class ResidualRows:
     """Whitened residuals of one output in one recording, and their sensitivities, for one refit step.
 
     `w` (M,) residuals; `weight` (M,) Huber's weights; `unknowns` (k,) indices in the refit's z.
@@ -109,7 +109,7 @@ class _Part(NamedTuple):
     gradient: np.ndarray
     matrix: np.ndarray
     residual: np.ndarray
-    rows: list[Rows]
+    rows: list[ResidualRows]
 
 
 class Problem:
@@ -280,7 +280,7 @@ class Problem:
         """Return recording r's free-run errors (N, ny), NaN where nothing was measured."""
         return self.excitations[r].y - self.model.run(self.excitations[r], values, dx0).y
 
-    def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[Rows] | None = None) -> Evaluation:
+    def evaluate(self, z: np.ndarray, jacobian: bool, keep: list[ResidualRows] | None = None) -> Evaluation:
         """Evaluate the cost, and with `jacobian` its derivatives. Raises SimulationError.
 
         The rows that `curvature` needs are appended to `keep`, if they may be kept (`keeps`). The next
@@ -352,7 +352,7 @@ class Problem:
                     matrix[k, k2] += 0.5 * slope * slope2 * second
         return cost, gradient, matrix
 
-    def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[Rows]) -> np.ndarray:
+    def curvature(self, z: np.ndarray, step: np.ndarray, kept: Sequence[ResidualRows]) -> np.ndarray:
         """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
 
         Raises SimulationError."""
@@ -387,7 +387,7 @@ class Problem:
         w: np.ndarray,
         weight: np.ndarray,
         jac: np.ndarray,
-    ) -> Rows:
+    ) -> ResidualRows:
         """Return output j's rows from its whitened residuals, their weights and sensitivities (N, k).
 
         White noise of one standard deviation only scales the sensitivities: they are not copied, and a
@@ -395,8 +395,8 @@ class Problem:
         """
         own, n = self.whitening[r][j], len(jac)
         if not own.white or len(own.index) < (1 - DOWNDATE_SHARE) * n:
-            return Rows(r, j, k, slope, own.whiten(jac), w, weight)
-        return Rows(r, j, k, slope / own.noise.sigma, jac, own.spread(w, n), own.spread(weight, n))
+            return ResidualRows(r, j, k, slope, own.whiten(jac), w, weight)
+        return ResidualRows(r, j, k, slope / own.noise.sigma, jac, own.spread(w, n), own.spread(weight, n))
 
 
 def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:

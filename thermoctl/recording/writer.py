@@ -166,7 +166,7 @@ class Tier:
         )
 
 
-class Limits(Protocol):
+class WriterSettings(Protocol):
     """The settings that a writer reads: settings.RecordingSettings, or the same fields in a test."""
 
     @property
@@ -202,7 +202,7 @@ class RecordingWriter:
 
     def __init__(
         self,
-        settings: Limits,
+        settings: WriterSettings,
         metadata: Mapping[str, str],
         rig: str = "rig",
         log: Callable[[str], None] = print,
@@ -354,7 +354,7 @@ class RecordingWriter:
         self._full_file = self._tier_file = None
 
 
-def disk_warning(settings: Limits) -> str:
+def disk_warning(settings: WriterSettings) -> str:
     """Return a sentence where the budgets are larger than the disk has room for; '' else."""
     folder = Path(settings.directory).absolute()
     place = next(p for p in (folder, *folder.parents) if p.exists())

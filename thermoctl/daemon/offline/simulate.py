@@ -17,7 +17,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.tick.assemble import compensator, law_parameters
-from thermoctl.daemon.tick.loop import RELOAD, Rig
+from thermoctl.daemon.tick.loop import RELOAD, Axis
 from thermoctl.daemon.tick.ring import Box, Mailbox
 from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.rig.make import make_backend
@@ -51,7 +51,7 @@ class Simulation:
             Box(np.zeros(1, np.uint64), np.zeros(packed_length(len(settings.channels.names)) + 1)),
         )
         self.quiet = publish is None
-        self.rig = Rig(
+        self.rig = Axis(
             self.backend,
             model or compensator(settings),
             parameters or law_parameters(settings),

@@ -10,7 +10,7 @@ cdef unsigned long long _OTHER_AXIS, _OWN_FAULTS
 cdef int _FAULT, _STATE_EVERY, _COUNTERS_AT, _SUSPEND_EVERY, _SUSPEND_NS, _THERMAL, _LATEST, _OFF, _STATE, _CODE, _ABSENT
 cdef double _DELAY_S
 
-cdef class Rig:
+cdef class Axis:
     cdef public object backend, publish_row, parameter_box, state_box, reading, row, wall_s, suspended_ns, channels
     cdef int _n
     cdef public Record record
@@ -27,7 +27,7 @@ cdef class Rig:
 
     @cython.locals(begin=cython.longlong, end=cython.longlong)
     cpdef tick(self, double now_s, double dt_s, double lateness_us=*, clock_ns=*)
-    @cython.locals(devices=DevicesBackend, other=Rig, c=cython.int, age=cython.double)
+    @cython.locals(devices=DevicesBackend, other=Axis, c=cython.int, age=cython.double)
     cpdef sample(self, double now_s)
     cpdef bint trips_others(self)
     cpdef _obey(self, double kind, double value)
@@ -42,10 +42,10 @@ cdef class Rig:
     cpdef keep_state(self)
 
 @cython.locals(lateness=Histogram, busy=Histogram)
-cdef _count(Rig rig, shared, double lateness_us, long long warm_up_ticks)
+cdef _count(Axis rig, shared, double lateness_us, long long warm_up_ticks)
 
 @cython.locals(paced=cython.bint, counted=cython.bint, period_ns=cython.longlong, spin_ns=cython.longlong,
                before=cython.longlong, now=cython.longlong, deadline=cython.longlong, slept=cython.longlong,
                slept_before=cython.longlong, gap_ns=cython.longlong, late_ns=cython.longlong, skipped=cython.longlong,
-               lateness_us=cython.double, now_s=cython.double, dt_s=cython.double, other=Rig)
-cpdef run_loop(settings, shared, Rig rig, stopping, long long warm_up_ticks=*, further=*)
+               lateness_us=cython.double, now_s=cython.double, dt_s=cython.double, other=Axis)
+cpdef run_loop(settings, shared, Axis rig, stopping, long long warm_up_ticks=*, further=*)

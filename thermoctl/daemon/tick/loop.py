@@ -27,12 +27,12 @@ from thermoctl.control.law import DELAY_S, Law
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.daemon.tick.arrival import put_counters
 from thermoctl.daemon.tick.clock import now_ns, sleep_until, suspended_ns, wall_s
-from thermoctl.daemon.tick.ring import Mailbox, Record, Remarks, Ring
+from thermoctl.daemon.tick.ring import Box, Mailbox, Record, Remarks, Ring
 from thermoctl.daemon.tick.shared import LOOP_PID, START_S, Shared
 from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.rig.signals import AT as SIGNAL_AT
 from thermoctl.rig.signals import of_channels
-from thermoctl_hal.base.backend import ABSENT
+from thermoctl_hal.base.backend import ABSENT, Backend
 from thermoctl_hal.rig.devices import DevicesBackend
 
 RELOAD = float(len(arming.COMMANDS))
@@ -56,8 +56,8 @@ _FAULT, _OTHER_AXIS = arming.FAULT, 1 << faults.BIT["other_axis"]
 _OWN_FAULTS = (1 << 64) - 1 - _OTHER_AXIS
 
 
-class Rig:
-    """Back end, law and record of one rig, and the stages of its tick.
+class Axis:
+    """Back end, law and record of one axis, and the stages of its tick. A rig without axes is one.
 
     backend: an open back end. publish: the ring that takes the finished rows, or a function that is called
     with each. mailbox, parameters, state, remarks: as in shared.Shared, or None where nobody commands or
@@ -66,14 +66,14 @@ class Rig:
 
     def __init__(
         self,
-        backend: Any,
+        backend: Backend,
         model: CompensatorModel,
         parameters: Parameters,
         period_s: float,
         publish: Ring | Callable[[np.ndarray], Any],
         mailbox: Mailbox | None = None,
-        parameter_box: Any = None,
-        state_box: Any = None,
+        parameter_box: Box | None = None,
+        state_box: Box | None = None,
         start_s: float = 0.0,
         remarks: Remarks | None = None,
         channels: Channels = DEFAULT,
@@ -90,7 +90,7 @@ class Rig:
         self.said = [(0.0, "")] * self._n
         self._status = np.zeros(self._n, np.uint8)
         self.slips = self.generation = self.external = self.write_failed = 0
-        self.guards: list[Rig] = []  # axes whose FAULT disarms this one
+        self.guards: list[Axis] = []  # axes whose FAULT disarms this one
         self.command, self.value, self.busy_us = arming.NONE, 0.0, 0.0
         self.wall_s: Callable[[], float] | None = None
         self.suspended_ns: Callable[[], int] | None = None
@@ -146,7 +146,7 @@ class Rig:
 
     def _obey(self, kind: float, value: float) -> None:
         if kind == RELOAD:
-            numbers = self.parameter_box.get()
+            numbers = None if self.parameter_box is None else self.parameter_box.get()
             if numbers is not None:
                 self.law.configure(Parameters.unpack(numbers))
                 self.generation += 1
@@ -236,10 +236,10 @@ class Rig:
 def run_loop(
     settings: Settings,
     shared: Shared,
-    rig: Rig,
+    rig: Axis,
     stopping: Callable[[], bool],
     warm_up_ticks: int = 100,
-    further: Sequence[tuple[Rig, Shared]] = (),
+    further: Sequence[tuple[Axis, Shared]] = (),
 ) -> None:
     """Tick until `stopping()`; the caller opens the back end before and disables the amplifier after.
 
@@ -290,7 +290,7 @@ def run_loop(
             deadline += skipped * period_ns
 
 
-def _count(rig: Rig, shared: Shared, lateness_us: float, warm_up_ticks: int) -> None:
+def _count(rig: Axis, shared: Shared, lateness_us: float, warm_up_ticks: int) -> None:
     """Add a tick to the histograms; at intervals publish the devices' counters."""
     if rig.law.tick % _STATE_EVERY == _COUNTERS_AT:
         put_counters(shared, rig.backend.counters())
