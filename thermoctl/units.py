@@ -3,7 +3,8 @@
     dimension("kW/m^2")        (("kg", 1), ("s", -3))
     conversion("degF", "K")    (5/9, 255.37): K = 5/9 degF + 255.37
 
-The one table of units for options, plants, recordings and columns. Its symbols need no pint, whose import takes half a second.
+The one table of units, for options, plants, recordings and columns. Its symbols need no pint, whose import
+takes half a second.
 """
 
 from __future__ import annotations
