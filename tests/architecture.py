@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -118,8 +118,42 @@ def allowed(page: str) -> dict[str, set[str]]:
     return table
 
 
+def floors(graph: Mapping[str, set[str]]) -> list[list[str]]:
+    """The packages by floor: each imports lower floors only. Packages that import each other in a circle are left out."""
+    below = {package(m): set() for m in graph}
+    for a, b in package_graph(graph):
+        below[a].add(b)
+    levels: list[list[str]] = []
+    done: set[str] = set()
+    while level := sorted(p for p in below if p not in done and below[p] <= done):
+        levels.append(level)
+        done |= set(level)
+    return levels
+
+
+def folders() -> dict[str, int]:
+    """Modules of each folder of the product, without `__init__`."""
+    return Counter(str(p.parent.relative_to(ROOT)) for p in modules().values() if p.stem != "__init__")
+
+
+def long_parts(lines: int = 400, function: int = 60) -> Iterator[tuple[str, int]]:
+    """Files and functions of the product above so many lines, longest first, each with its lines."""
+    files, functions = [], []
+    for path in modules().values():
+        source = path.read_text(encoding="utf-8")
+        files.append((source.count("\n"), str(path.relative_to(ROOT))))
+        if path.suffix == ".py":
+            for node in ast.walk(ast.parse(source)):
+                if isinstance(node, ast.FunctionDef):
+                    functions.append(
+                        (node.end_lineno - node.lineno + 1, f"{path.relative_to(ROOT)}:{node.name}")
+                    )
+    for parts, limit in ((files, lines), (functions, function)):
+        yield from ((name, n) for n, name in sorted(parts, reverse=True) if n > limit)
+
+
 def text(graph: Mapping[str, set[str]]) -> str:
-    """The arrows between packages and the circles between modules, for people."""
+    """Floors, arrows between packages, circles, full folders and long parts, for people."""
     arrows = package_graph(graph)
     lines = [f"{len(graph)} modules, {len(arrows)} arrows between packages"]
     for name in sorted({package(m) for m in graph}):
@@ -127,7 +161,15 @@ def text(graph: Mapping[str, set[str]]) -> str:
         lines.append(f"  {name:<12} -> {', '.join(ends) or '(nothing of ours)'}")
     rings = circles(graph)
     lines.append(f"{len(rings)} circles between modules")
-    return "\n".join([*lines, *("  " + ", ".join(ring) for ring in rings)])
+    lines += ["  " + ", ".join(ring) for ring in rings]
+    levels = floors(graph)
+    lines += [
+        f"{len(levels)} floors of packages",
+        *(f"  {k:>2} {', '.join(level)}" for k, level in enumerate(levels)),
+    ]
+    lines += ["folders of more than 15 modules", *(f"  {n:>4} {f}" for f, n in folders().items() if n > 15)]
+    lines += ["files over 400 lines, functions over 60", *(f"  {n:>4} {name}" for name, n in long_parts())]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
