@@ -49,7 +49,9 @@ for _tag, _regex, _first in (
 
 def dumps(data: Any) -> str:
     """Return plain data as YAML text that this module reads back equal."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=150, default_flow_style=None
+    )
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,11 @@ def test_heat_from_outside_is_found_with_its_interval(tmp_path):
     assert finding["when"][0] == pytest.approx([500, 900], abs=15)
     value = next(p for n, p in finding["parameters"].items() if n.startswith("Q"))
     assert abs(value["value"] - 0.3) < max(4 * value["sd"], 0.01)
+    extended = load(tmp_path / "out" / "plant.yaml").parameters
+    assert all(
+        extended[n].value == pytest.approx(p["value"], rel=1e-9) for n, p in finding["parameters"].items()
+    )
+    assert "range: [" in (tmp_path / "out" / "plant.yaml").read_text(), "short lists stand on one line"
 
 
 def test_an_offset_begins_at_its_sample_and_says_how_surely(tmp_path):

@@ -245,3 +245,21 @@ def test_arrows_end_at_the_boxes_and_not_under_them(file):
             axis=2
         )  # pixels inside
         assert np.abs(depth).min(axis=1).max() < 3, dpi
+
+
+@pytest.mark.parametrize("widest", [40.0, 10.0, 3.6])
+@pytest.mark.parametrize("file", [THERMAL, "config/plants/actuator.yaml"])
+def test_a_network_is_as_wide_as_its_page_and_no_box_covers_another(file, widest):
+    from thermoctl.plant.show import drawing
+
+    figure = drawing(load(file), widest=widest, title=False)
+    assert figure.get_figwidth() <= widest
+    figure.canvas.draw()
+    boxes = [
+        q.get_bbox_patch().get_window_extent().padded(-1)
+        for q in figure.axes[0].texts
+        if q.get_bbox_patch() is not None and q.get_text()
+    ]
+    assert len(boxes) > 20 and not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    page = figure.bbox
+    assert all(page.containsx(x) and page.containsy(y) for b in boxes for x, y in b.corners())

@@ -156,7 +156,8 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0, ti
         _arrow(axes, _edge(taken[a], x[a], x[b]), _edge(taken[b], x[b], x[a]), kind)
     for a, b, _, label in edges:
         if label:
-            _label(axes, (x[a] + x[b]) / 2, label, taken, canvas, inch)
+            ends = _edge(taken[a], x[a], x[b]), _edge(taken[b], x[b], x[a])
+            _label(axes, ends, label, taken, canvas, inch)
     low[1] -= _legend(axes, low, max(high[0], low[0] + 3.3), canvas, inch)
     if title:
         words = textwrap.fill(plant.title, max(int((high[0] - low[0]) * 9.5), 20))
@@ -172,8 +173,9 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0, ti
 
 UNIT_IN = np.array([1.5, 0.85])  # inches of a unit of length, before texts push each other apart
 APART_IN = 0.12  # least distance of two boxes
+BARE_IN = 0.4  # least length of an edge beside its label
 MARGIN = 0.08  # inches round the drawing
-PUSHES = 300  # rounds in which boxes that overlap push each other apart
+PUSHES, STRETCH = 300, 1.003  # rounds in which boxes that overlap push each other apart; growth in each
 _STYLE = {  # edge, face, font size, word of the legend
     "node": ("#0b6bcb", "#f3f6f9", 9.5, "stored quantity"),
     "in": ("#c7621b", "#f3f6f9", 8.5, "flow from outside"),
@@ -221,7 +223,7 @@ def _places(vertices: list[Vertex], edges: list[Edge], sizes: np.ndarray, widest
         if not depth.any():
             break
         up = np.where(way[:, :, 1] == 0, np.arange(len(x))[:, None] - np.arange(len(x)), way[:, :, 1])
-        x[:, 1] += (0.25 * depth * np.sign(up)).sum(axis=1) + 0.0
+        x[:, 1] = STRETCH * x[:, 1] + (0.25 * depth * np.sign(up)).sum(axis=1)
     return x
 
 
@@ -255,16 +257,23 @@ def _arrow(axes: Axes, start: np.ndarray, end: np.ndarray, kind: str) -> None:
 
 
 def _label(
-    axes: Axes, at: np.ndarray, label: str, taken: list[np.ndarray], canvas: FigureCanvasAgg, inch: float
+    axes: Axes,
+    ends: tuple[np.ndarray, np.ndarray],
+    label: str,
+    taken: list[np.ndarray],
+    canvas: FigureCanvasAgg,
+    inch: float,
 ) -> None:
-    """Write the label of an edge where it covers no box and no other label; `taken` gains its place."""
+    """Write the label of an edge where there is room for it; `taken` (boxes and labels) gains its place."""
+    at, way = (ends[0] + ends[1]) / 2, np.abs(ends[1] - ends[0])
     words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
     box = {"boxstyle": "square,pad=0.1", "fc": "#ffffff", "ec": "none"}
     text = axes.text(
         at[0], at[1], words, fontsize=7.5, color="#7d8894", ha="center", va="center", zorder=2, bbox=box
     )
     half = _size(text, canvas, inch) / 2
-    if any((at + half > q[0]).all() and (at - half < q[1]).all() for q in taken):
+    bare = np.linalg.norm(way) * (1 - float(np.min(2 * half / np.maximum(way, 1e-9))))
+    if bare < BARE_IN or any((at + half > q[0]).all() and (at - half < q[1]).all() for q in taken):
         text.remove()
     else:
         taken.append(np.array([at - half, at + half]))

@@ -17,7 +17,9 @@ def explain(found: Mapping[str, Any]) -> str:
     lines += [f"    {value:>10}  {meaning}" for meaning, value in figures.decision_rows(found)[1]]
     heads, rows = figures.hypothesis_rows(found)
     lines += ["".join(f"{cell:>16}" for cell in row[1:]) + f"  {row[0]}" for row in (heads, *rows[:SHOWN])]
-    lost = "; ".join(f"{row[0]} ({row[1]})" for row in figures.lost_rows(found)[1][:LOST])
+    lost = "; ".join(
+        f"{row[0]} ({row[1]})" for row in figures.lost_rows(found)[1][: min(LOST, len(found["lost"]))]
+    )
     lines.append(f"tried and lost: {lost or 'nothing'}")
     budget = "; the budget of refits ended the search" if found["truncated"] else ""
     lines.append(f"hypotheses not shown: {max(len(rows) - SHOWN, 0)} (in diagnosis.json){budget}")

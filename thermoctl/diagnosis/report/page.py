@@ -35,10 +35,11 @@ TONES = {"consistent": "good", "explained": "good", "unexplained": "bad"}
 def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) -> None:
     """Write report.html of a diagnosis; `result`: the content of its diagnosis.json."""
     drawn = _ordered(curves(found), outputs(result), figures.extends(result))
-    rest = folded(f"{len(drawn) - 1} more curves", "".join(_compared(c, result) for c in drawn[1:]))
+    more = "".join(_compared(c, result) for c in drawn[1:])
+    rest = folded(f"{len(drawn) - 1} more curves", f'<div class="grid">{more}</div>' if more else "")
     law = (result["remainder"] or {}).get("law")
     sections = [
-        ("", _lead(result) + "".join(_compared(c, result) for c in drawn[:1])),
+        ("", _lead(result) + "".join(_compared(c, result, True) for c in drawn[:1])),
         ("What next", _next(result)),
         ("The likeliest" if result["verdict"] == "ambiguous" else "What was found", _findings(found, result)),
         ("A law for what remains", law_section(found.law, law)),
@@ -78,7 +79,7 @@ def _lead(result: Mapping[str, Any]) -> str:
     return f'<p class="lead"><b class="{tone}">{words}.</b> {html.escape(" ".join(sentences(result)))}</p>'
 
 
-def _compared(c: Curve, result: Mapping[str, Any]) -> str:
+def _compared(c: Curve, result: Mapping[str, Any], first: bool = False) -> str:
     aside = str(result["fit"]["held_out"]).startswith("recordings")
     if not c.held_out:
         how = "It took part in the fit."
@@ -86,9 +87,10 @@ def _compared(c: Curve, result: Mapping[str, Any]) -> str:
         how = "It was set aside: it took no part in any choice or fit."
     else:
         how = "Each part is predicted by a fit to the other parts; the first is always fitted."
-    text = f"{c.output} in {c.recording}, simulated on the recorded inputs alone. {how} "
-    percent = "Percentages: fit, 100 (1 − |error| / |reading − its mean|)."
-    return compared(c, text + (percent if any(c.fit_percent(k) is not None for k in c.errors) else ""))
+    text = f"{c.output} in {c.recording}, simulated on the recorded inputs alone. {how}"
+    if first and any(c.fit_percent(k) is not None for k in c.errors):
+        text += " Percentages: fit, 100 (1 − |error| / |reading − its mean|)."
+    return compared(c, text, first)
 
 
 def _next(result: Mapping[str, Any]) -> str:

@@ -25,9 +25,10 @@ SHADES = {"before": GREY, "refit_only": ORANGE, "after": BLUE}
 SCALES = ((2 * 86400.0, 86400.0, "days"), (7200.0, 3600.0, "h"), (0.0, 1.0, "s"))  # from a span, s
 
 
-def compared(c: Curve, caption: str) -> str:
+def compared(c: Curve, caption: str, broad: bool) -> str:
     """Return the figure of a measured output beside its simulations, their errors below."""
-    return figure(_compared(c, BROAD, 4.3), caption, _compared(c, NARROW, 4.3))
+    narrow = _compared(c, NARROW, 4.3)
+    return figure(_compared(c, BROAD, 4.3), caption, narrow) if broad else figure(narrow, caption)
 
 
 def _compared(c: Curve, width: float, height: float) -> Figure:
