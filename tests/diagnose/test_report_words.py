@@ -148,7 +148,7 @@ def test_a_remainder_has_a_size_and_its_measure_beside_it(found):
     for size, name in re.findall(rf"{NUMBER}(?: \w+)? of (\w+) remains that nothing known explains", text):
         assert float(size) > 0 and f"beside {number(rows[name].noise)}" in text
         assert ("and steps of" in text) is (rows[name].left < rows[name].step)
-    if "smaller than its noise" in text:
+    if "no larger than its noise" in text:
         assert all((o.over_noise or 0) <= 1 for o in rows.values()) and found["decision"]["remains"] >= 0.5
     if found["verdict"] in ("explained", "consistent"):
         assert "remains" not in text

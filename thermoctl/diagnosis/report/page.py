@@ -117,8 +117,9 @@ def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
         for n in f["parameters"]:
             equation = equation.replace(n, figures.short(n, f))
             end = n.removeprefix(figures.short(n, f)) or end
-        body += f"<h3>{html.escape(name(f))} (probability {chance(f['probability'])})</h3>"
-        body += f"{_p(effect.title + '.')}<pre>{html.escape(equation)}</pre>"
+        sure = f"probability {chance(f['probability'])}; that other data confirm it {chance(f['confirmed'])}"
+        body += f"<h3>{html.escape(name(f))}</h3>{_p(f'{effect.title}: {sure}.')}"
+        body += f"<pre>{html.escape(equation)}</pre>"
         heads, rows = figures.parameter_rows(f)
         body += _table((heads, [(*r[:2], unit(r[2])) for r in rows]))
         if f.get("members"):

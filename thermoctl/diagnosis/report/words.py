@@ -54,8 +54,8 @@ def what_next(found: Result) -> str:
     text = NEXT[found["verdict"]]
     if found["verdict"] == "consistent" and _likely(found):
         text = PERHAPS
-    elif found["verdict"] == "unexplained" and _small(outputs(found)):
-        text = SMALL
+    elif found["verdict"] in ("unexplained", "partly_explained") and _small(outputs(found)):
+        text = f"Use the extended plant. {SMALL}" if found["findings"] else SMALL
     if found["truncated"]:
         text += " The budget of refits ended the search: more effects may be hidden."
     return text
@@ -162,6 +162,6 @@ def _remainder(found: Result, rows: Sequence[Output]) -> str:
     else:
         if found["decision"].get("remains", 0.0) < NOT_RANDOM:
             return ""
-        text = f"What remains of {o.name} is smaller than its noise of {noise}, but not random"
+        text = f"What remains of {o.name} is no larger than its noise of {noise}, but not random"
     text += f"; it enters at {r['node']}" if r["node"] else ""
     return text + (f" and follows {listed(list(r['follows']))}." if r["follows"] else ".")
