@@ -110,7 +110,7 @@ TABLE: Table = {
                 help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
             ),
             argument(
-                "--explain", metavar="DIR", help="print in ten lines the reasons of the diagnosis in DIR"
+                "--explain", metavar="DIR", help="print the reasons of the diagnosis in DIR"
             ),
             argument(
                 "--why",

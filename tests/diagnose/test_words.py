@@ -72,6 +72,16 @@ def test_findings_are_told_by_size_with_units():
     )
 
 
+def test_effects_that_imitate_each_other_are_told_together():
+    two = [RADIATION | {"probability": 0.5}, LAG | {"probability": 0.46, "parameters": {}}]
+    family = {"effects": two, "probability": 0.97}
+    told = words(FOUND | {"verdict": "ambiguous", "findings": [], "alternatives": two, "families": [family]})
+    assert (
+        "One of these is there (probability 0.97), not told which: radiation at block or sensor lag at reading."
+        in told
+    )
+
+
 @pytest.mark.parametrize(
     ("verdict", "start"),
     [("consistent", "The recordings agree"), ("unexplained", "Something is missing that no effect")],

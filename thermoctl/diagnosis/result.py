@@ -210,7 +210,6 @@ def _notes(d: Diagnosis) -> list[str]:
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
         *filter(None, [d.unknown]),
-        *map(_one_of, d.families),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "
             f"{chance(d.posterior.effects.get((effect, where), 0.0))})"
@@ -218,13 +217,6 @@ def _notes(d: Diagnosis) -> list[str]:
         ),
         *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
     ]
-
-
-def _one_of(family: Family) -> str:
-    """Return a sentence that says what is sure of effects that imitate each other."""
-    return "one of these is there for sure, and the recordings do not tell which: " + ", ".join(
-        f"{e} at {w}" for e, w in family.members
-    )
 
 
 def unfinished(*fits: Fitted) -> list[str]:

@@ -1,4 +1,4 @@
-"""Why a diagnosis came out as it did, in ten lines, from diagnosis.json alone."""
+"""Why a diagnosis came out as it did, in a screen of lines, from diagnosis.json alone."""
 
 from __future__ import annotations
 

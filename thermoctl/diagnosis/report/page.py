@@ -122,8 +122,6 @@ def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
         body += f"<pre>{html.escape(equation)}</pre>"
         heads, rows = figures.parameter_rows(f)
         body += _table((heads, [(*r[:2], unit(r[2])) for r in rows]))
-        if f.get("members"):
-            body += _p(f"Of this family: {listed([name({**f, **m}) for m in f['members']])}.")
         excited = f"Excited by: {effect.excited_by}. " if effect.excited_by else ""
         where = f"In plant.yaml these names end in {end}. " if end else ""
         body += f'<p class="note">{html.escape(f"{where}{excited}Source: {effect.source}.")}</p>'

@@ -35,7 +35,7 @@ def sentences(found: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
     rows = outputs(found)
     law = law_sentence((found["remainder"] or {}).get("law"))
-    told = [_found(found, rows), law]
+    told = [_found(found, rows), *map(_one_of, found.get("families", ())), law]
     if rows and (found["findings"] or law):
         told.append(_gain(found, max(rows, key=lambda o: o.gain)))
     return [text for text in (*told, _remainder(found, rows)) if text]
@@ -127,6 +127,11 @@ def _found(found: Result, rows: Sequence[Output]) -> str:
     doubted = [name(a) for a in found["alternatives"] if a.get("why_not")][:2]
     fits = f" {listed(doubted).capitalize()} would fit, but nothing else confirms it." if doubted else ""
     return f"{what} that no effect of the catalogue explains{follows}.{fits}"
+
+
+def _one_of(family: Result) -> str:
+    names = " or ".join(name(e) for e in family["effects"])
+    return f"One of these is there (probability {chance(family['probability'])}), not told which: {names}."
 
 
 def _doubt(alternative: Result) -> str:
