@@ -109,9 +109,7 @@ TABLE: Table = {
                 metavar="DIR",
                 help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
             ),
-            argument(
-                "--explain", metavar="DIR", help="print the reasons of the diagnosis in DIR"
-            ),
+            argument("--explain", metavar="DIR", help="print the reasons of the diagnosis in DIR"),
             argument(
                 "--why",
                 metavar="EFFECT",

@@ -201,7 +201,7 @@ def summary(found: dict[str, Any], out: str | Path) -> None:
     if found["findings"]:
         rows = []
         for f in found["findings"]:
-            first = (f["effect"], f["where"], f["equation"])
+            first = (f["effect"], f["where"], figures.equation(f))
             for row in figures.parameter_rows(f)[1]:
                 rows.append((*first, *row))
                 first = ("", "", "")

@@ -146,6 +146,14 @@ def short(parameter: str, finding: Result) -> str:
     return parameter.removesuffix(f"_{finding['effect']}_{place}")
 
 
+def equation(finding: Result) -> str:
+    """Return a finding's equation with the short names of its parameters."""
+    text = str(finding["equation"])
+    for n in finding["parameters"]:
+        text = text.replace(n, short(n, finding))
+    return text
+
+
 def extends(found: Result) -> bool:
     """Return whether the result is a plant with something that it lacked."""
     return bool(found["findings"] or (found["remainder"] or {}).get("law"))

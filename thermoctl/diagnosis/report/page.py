@@ -113,13 +113,12 @@ def _table(rows: Rows, caption: str = "") -> str:
 def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
     body = ""
     for f, e in zip(result["findings"], found.shown, strict=True):
-        effect, equation, end = e.candidate.effect, f["equation"], ""
+        effect, end = e.candidate.effect, ""
         for n in f["parameters"]:
-            equation = equation.replace(n, figures.short(n, f))
             end = n.removeprefix(figures.short(n, f)) or end
         sure = f"probability {chance(f['probability'])}; that other data confirm it {chance(f['confirmed'])}"
         body += f"<h3>{html.escape(name(f))}</h3>{_p(f'{effect.title}: {sure}.')}"
-        body += f"<pre>{html.escape(equation)}</pre>"
+        body += f"<pre>{html.escape(figures.equation(f))}</pre>"
         heads, rows = figures.parameter_rows(f)
         body += _table((heads, [(*r[:2], unit(r[2])) for r in rows]))
         excited = f"Excited by: {effect.excited_by}. " if effect.excited_by else ""
