@@ -25,7 +25,7 @@ inputs: {heat: {unit: W}, air: {unit: degC}}
 parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
 nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
 flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
-outputs: {T_block: {value: T, unit: degC, noise: 0.05}}
+outputs: {T_block: {value: T, unit: degC, noise: 0.2}}
 """
 RADIATES = BLOCK.replace(
     "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
@@ -79,7 +79,7 @@ def recorded(name, folder, monkeypatch):
     """Files of a plant and its recordings, whose diagnosis has the verdict."""
     if name == "ambiguous":
         t = np.arange(240) * 5.0
-        heat = np.where((np.abs(t - 156) < 36) | (np.abs(t - 636) < 36), 20.0, 0.0)
+        heat = np.where((np.abs(t - 156) < 75) | (np.abs(t - 736) < 75), 20.0, 0.0)
         table = Table("run_1", "run_1", t, {"heat": heat, "air": np.full(len(t), 22.0)})
         (folder / "plant.yaml").write_text(BLOCK)
         write_table(folder / "run_1.csv", compile_plant(loads(RADIATES), ()).measure(table, seed=1))
