@@ -469,16 +469,23 @@ def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("effect: mine\n", "needs 'title'"),
+        ("effect: mine\n", "'where' is missing"),
         (
             "effect: m\ntitle: T\nwhere: temperature_nod\nsource: s\nchange: []\nparameters: {}\n",
             "did you mean 'temperature_node'",
         ),
         (
             "effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{vlaue: y}]\nparameters: {}\n",
-            "a change must be one of",
+            "'vlaue' is not a change (did you mean 'value'?)",
         ),
-        ("effect: m\ncolour: red\n", "unknown key 'colour'"),
+        (
+            "effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{value: y}]\nparameters: {}\ncolour: red\n",
+            "unknown key 'colour'",
+        ),
+        (
+            "effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{value: y * G}]\nparameters: {g: {low: 0}}\n",
+            "bad.yaml:5:18: value: 'G' is not known here; allowed are air",
+        ),
     ],
 )
 def test_a_bad_effect_file_gives_its_one_error(tmp_path, text, words):

@@ -24,7 +24,7 @@ from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import UNIFORM, as_refitted, fitted
 from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Limits, courses, family, levers
 from thermoctl.diagnosis.hypothesis.candidates import candidates
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
 from thermoctl.diagnosis.verdict.decide import Key
 from thermoctl.plant.language import Plant

@@ -12,7 +12,8 @@ from thermoctl.diagnosis.evidence.held_out import split, worth
 from thermoctl.diagnosis.evidence.levels import remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
 from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.hypothesis.catalogue import Effect, contained
+from thermoctl.diagnosis.hypothesis.catalogue import contained
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
 from thermoctl.diagnosis.law.find import Law, found_law
 from thermoctl.diagnosis.law.forms import LAW

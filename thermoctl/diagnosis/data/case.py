@@ -18,7 +18,7 @@ from thermoctl.diagnosis.data.grids import Grid, grid
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.plant import expression as ex
 from thermoctl.plant.cores import give_back

@@ -25,7 +25,7 @@ from thermoctl.diagnosis.evidence.onsets import moved
 from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
 from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
-from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import refit
 from thermoctl.plant.climb import Climbed, bounded_step
 from thermoctl.plant.estimate import updated

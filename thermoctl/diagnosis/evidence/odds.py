@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Limits
 
 

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.coordinates import Channel, transform
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
-from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
 from thermoctl.plant.climb import Climbed, Spot, climb
 from thermoctl.plant.language import Plant

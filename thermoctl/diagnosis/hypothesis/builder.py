@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.hypothesis.catalogue import Effect, EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import Effect, EffectParameter
 from thermoctl.diagnosis.hypothesis.places import ERRORS, Place, heats, outlet
 from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex

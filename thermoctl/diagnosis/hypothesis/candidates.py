@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from thermoctl.diagnosis.hypothesis.builder import Builder, Placement
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, askable
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex

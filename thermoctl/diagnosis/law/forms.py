@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl import yamlfile
-from thermoctl.diagnosis.hypothesis.catalogue import Effect, EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import Effect, EffectParameter
 from thermoctl.diagnosis.law.memory import MEMORIES
 from thermoctl.diagnosis.law.signals import Place, Signal, Values
 from thermoctl.plant import expression as ex

@@ -19,7 +19,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.noise import Averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values

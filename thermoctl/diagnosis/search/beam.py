@@ -14,7 +14,7 @@ from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted,
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.limits import Limits
 from thermoctl.diagnosis.search.extend import extend, sticking, weaker

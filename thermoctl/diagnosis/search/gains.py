@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import gammaincc
 
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
-from thermoctl.diagnosis.hypothesis.catalogue import EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.plant import expression as ex
 

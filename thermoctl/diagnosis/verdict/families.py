@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.hypothesis.catalogue import Effect
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.verdict.decide import Posterior
 
 MEMBER = 0.02  # probability from which an effect is a member

@@ -1,0 +1,343 @@
+"""An effect of the catalogue, and the reader of its file: strict, key by key.
+
+A wrong key, an unknown name in an expression or a change that is none is one error with its place in the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermoctl import yamlfile
+from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import Expr
+from thermoctl.units import dimension
+from thermoctl.yamlfile import Node, Section, suggest
+
+SYMBOLS: Mapping[str, tuple[str, ...]] = {
+    "node": ("n",),
+    "node_pair": ("m", "n"),
+    "temperature_node": ("T",),
+    "velocity_node": ("v",),
+    "conductance": ("T",),
+    "temperature_pair": ("TA", "TB"),
+    "heated_pair": ("TA", "TB", "a", "b"),
+    "joule_flow": ("T",),
+    "motor": ("v",),
+    "drive": ("u",),
+    "sensor": ("y",),
+    "body_sensor": ("y",),
+    "passive_sensor": ("y",),
+    "reading_in_air": ("y",),
+    "position_sensor": ("y",),
+    "displacement": ("y",),
+    "member": ("y", "T"),
+    "bending_pair": ("y", "TA", "TB"),
+    "voltage_sensor": ("y", "a"),
+    "level_node": ("a", "b"),
+    "orifice": (),
+    "resistive": (),
+    "fixed_node": ("T",),
+    "fixed_flow": (),
+}
+"""The symbols of each place that an effect's expressions may read; its nodes are also ends of flows."""
+EVERYWHERE = ("air", "reference", "duration", "sample", "t")
+NEEDS = ("x", "v", "i", "T")
+SHAPES: Mapping[str, tuple[str, ...]] = {
+    "onsets": ("onset",),
+    "windows": ("start", "end"),
+    **dict.fromkeys(("times", "lags", "delays"), ("tau",)),
+    "periods": ("period",),
+    "phases": ("phase",),
+    **dict.fromkeys(("end_levels", "high_levels", "drive_levels", "small_levels"), ("level",)),
+    "speeds": ("speed",),
+    "creep_speeds": ("creep",),
+    "distances": ("distance",),
+}
+"""The kinds of shapes, and the names of the values that each gives to parameters and trials."""
+FORMS = ("rate", "value", "storage", "drive", "resistance")
+PARTS = {
+    "flow": (("rate",), ("from", "into")),
+    "node": (("name", "storage", "initial"), ("unit", "initial_sigma")),
+    "split": (("from", "into", "share"), ()),
+    "spill": (("from", "into", "level", "share"), ()),
+}
+"""The keys of a change that is a mapping: required ones, others."""
+_STARTS = ("start_of_T", "start_of_y", "start_of_x", "first_air")
+OWN = {"rate": "rate", "storage": "storage", "resistance": "R"}
+"""The symbol that stands, in a change of this kind, for the plant's own expression."""
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One parameter of an effect.
+
+    - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
+    - `shape`: the shape that it is
+    - `null`: its value where the effect is absent
+    - `at_zero`: where it is 0 the effect is the simpler one that it contains
+    - `of`: 'jump': low and high count in the largest sudden change of what the sensor reads"""
+
+    name: str
+    unit: str | None
+    low: float
+    high: float
+    null: float
+    trial: Expr | None
+    shape: str | None
+    per_recording: bool
+    typical: float | None
+    origin: str | None  # 'first_air': bounds count from the first ambient; 'exponent': null is the outlet's
+    at_zero: bool = False
+    of: str | None = None
+
+    @property
+    def amplitude(self) -> bool:
+        """Does it scale with an amplitude of the screening?"""
+        return _amplitudes(self.trial) > 0
+
+    def fades(self, shapes: Mapping[str, str]) -> bool:
+        """Is the effect absent where this parameter has its null value? `shapes`: those of its effect."""
+        return self.amplitude or shapes.get(self.shape or "") in ("small_levels", "lags", "delays")
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue."""
+
+    name: str
+    title: str
+    where: str
+    needs: tuple[str, ...]
+    changes: tuple[tuple[Mapping[str, Any], ...], ...]  # the change and its variants
+    shapes: Mapping[str, str]
+    parameters: tuple[EffectParameter, ...]
+    dims: tuple[tuple[float, ...], ...]
+    excited_by: str
+    mimics: tuple[str, ...]
+    source: str
+    caution: str | None = None  # limits of a finding of it, in words
+    prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
+    contains: str | None = None  # the simpler effect that it is for some values of its parameters
+    reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
+
+    def at(self, exponent: float | None) -> Effect | None:
+        """Return the entry at an outlet with this exponent in the plant file; None beyond its bounds."""
+        own = [p for p in self.parameters if p.origin == "exponent"]
+        if exponent is None or not own:
+            return self
+        if not all(p.low <= exponent <= p.high for p in own):
+            return None
+
+        def told(p: EffectParameter) -> EffectParameter:
+            """Return the parameter with the outlet's exponent as its null value."""
+            if p.origin != "exponent" or p.trial is None:
+                return p
+            known = {"exponent": ex.num(exponent)}
+            trial = ex.substitute(p.trial, lambda e: known.get(str(e.value)) if e.op == "name" else None)
+            return dataclasses.replace(p, null=exponent, trial=trial)
+
+        return dataclasses.replace(self, parameters=tuple(map(told, self.parameters)))
+
+    @property
+    def timed(self) -> bool:
+        """Does it depend on the time itself, or have values of its own in each recording?"""
+        named = re.search(r"\bt\b", str(self.changes))
+        return bool(named) or any(p.per_recording for p in self.parameters)
+
+
+def read(root: Node) -> Effect:
+    """Return the effect of a file. Raises InputError with file, line and column at the first mistake."""
+    top = Section(root, "an effect file")
+    name, where = top.text("effect"), top.text("where", choices=SYMBOLS)
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise top.get("effect").error(f"'{name}': a name of small letters, digits and '_' was expected")
+    title, source = top.text("title"), top.text("source")
+    excited_by, caution, contains = (top.text(key, "") for key in ("excited_by", "caution", "contains"))
+    mimics = top.list("mimics", required=False)
+    for node in mimics:
+        if not isinstance(node.value, str):
+            raise node.error("mimics: names of effects were expected")
+    needs = top.list("needs", required=False)
+    for node in needs:
+        if node.value not in NEEDS:
+            raise node.error(f"needs: one of {', '.join(NEEDS)} was expected, found {yamlfile.kind_of(node)}")
+    shapes = _shapes(top)
+    sections = top.sections("parameters")
+    given = {n for kind in shapes.values() for n in SHAPES[kind]}
+    parameters = tuple(_parameter(q, p, given, sections) for q, p in sections.items())
+    amplitudes = max((_amplitudes(p.trial) for p in parameters), default=0)
+    dims = _dims(top, amplitudes)
+    reads = tuple(str(node.value) for node in top.list("reads", required=False))
+    known = {*SYMBOLS[where], *(str(n.value) for n in needs), *reads, *EVERYWHERE, *sections}
+    prior = top.given("prior")
+    changes = _lists_of_changes(top, known, set(sections), where)
+    effect = Effect(
+        name,
+        title,
+        where,
+        tuple(str(n.value) for n in needs),
+        changes,
+        shapes,
+        parameters,
+        dims,
+        excited_by,
+        tuple(str(n.value) for n in mimics),
+        source,
+        caution or None,
+        _expression(prior, {*sections, "duration", "first_air"}, "prior") if prior else None,
+        contains or None,
+        reads,
+    )
+    top.end()
+    return effect
+
+
+def _shapes(top: Section) -> dict[str, str]:
+    """Return the kind of each of the effect's shapes."""
+    section = top.section("shapes", required=False)
+    return {key: section.text(key, choices=SHAPES) for key in section.node.value} if section else {}
+
+
+def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, Section]) -> EffectParameter:
+    """Read a parameter; `given`: the names of the values that the effect's shapes give."""
+    low, high = p.number("low", -np.inf), p.number("high", np.inf)
+    if not low <= high:  # equal: a known value
+        raise p.node.error(f"parameter '{name}': low {low:g} must not be above high {high:g}")
+    unit = p.text("unit", "")
+    if unit and not re.search(r"\bunit_of(_\w+)?", unit):
+        try:
+            dimension(unit)
+        except ValueError as e:
+            raise p.get("unit").error(f"parameter '{name}': {e}") from None
+    shape, trial = p.given("shape"), p.given("trial")
+    if shape is not None and shape.value not in given:
+        raise shape.error(
+            f"parameter '{name}': shape '{shape.value}' is none of this effect's shapes ({', '.join(sorted(given)) or 'none'})"
+        )
+    value = None if shape is not None else ex.name("s")
+    if trial is not None:
+        steps = {f"s{k}" for k in range(2, 10)} | {"s"}
+        value = _expression(
+            trial, {*steps, *given, "first_air", "exponent", *parameters}, f"trial of '{name}'"
+        )
+    origin, of = (
+        p.text("origin", "none", choices=("none", "first_air", "exponent")),
+        p.text("of", "none", choices=("none", "jump")),
+    )
+    null, typical = p.optional_number("null"), p.optional_number("typical")
+    parameter = EffectParameter(
+        name,
+        unit or None,
+        low,
+        high,
+        null or 0.0,
+        value,
+        None if shape is None else str(shape.value),
+        p.flag("per_recording", False),
+        typical,
+        None if origin == "none" else origin,
+        p.flag("at_zero", False),
+        None if of == "none" else of,
+    )
+    p.end()
+    return parameter
+
+
+def _dims(top: Section, count: int) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of amplitudes, one for each amplitude where the file has none."""
+    rows = top.list("dims", required=False)
+    for row in rows:
+        if not isinstance(row.value, list) or len(row.value) != count:
+            raise row.error(f"dims: rows of {count} numbers were expected, one for each amplitude s, s2 ...")
+    return tuple(tuple(row.plain()) for row in rows) or tuple(map(tuple, np.eye(max(count, 1)).tolist()))
+
+
+def _amplitudes(trial: Expr | None) -> int:
+    """Return the number of amplitudes s, or s1, s2, ..., in a trial value."""
+    names = ex.names(trial) if trial is not None else ()
+    return max((int(n[1:] or 1) for n in names if re.fullmatch(r"s\d*", n)), default=0)
+
+
+def _expression(node: Node, known: Iterable[str], what: str) -> Expr:
+    if isinstance(node.value, dict | list):
+        raise node.error(f"{what}: an expression was expected, found {yamlfile.kind_of(node)}")
+    try:
+        read = ex.parse(str(node.value))
+    except ex.ExpressionError as e:
+        raise node.error(f"{what}: {e}") from None
+    allowed = sorted(set(known))
+    for n in sorted(ex.names(read) - set(allowed)):
+        raise node.error(
+            f"{what}: '{n}' is not known here{suggest(n, allowed)}; allowed are {', '.join(allowed)}"
+        )
+    return read
+
+
+def _lists_of_changes(
+    top: Section, known: set[str], parameters: set[str], where: str
+) -> tuple[tuple[Mapping[str, Any], ...], ...]:
+    """Return the change and its variants."""
+    variants = top.list("variants", required=False)
+    for node in variants:
+        if not isinstance(node.value, list):
+            raise node.error("variants: a list of changes was expected for each")
+    for changes in (top.list("change"), *(v.value for v in variants)):
+        if not changes:
+            raise top.get("change").error("change: at least one change was expected, such as {flow: {...}}")
+        _changes(changes, known, parameters, where)
+    return tuple(tuple(node.plain()) for node in (top.get("change"), *variants))
+
+
+def _changes(changes: Sequence[Node], known: set[str], parameters: set[str], where: str) -> None:
+    made: set[str] = set()
+    for item in changes:
+        if not isinstance(item.value, dict) or len(item.value) != 1:
+            raise item.error("change: one mapping for each change was expected, such as {flow: {...}}")
+        ((kind, node),) = item.value.items()
+        if kind in FORMS:
+            _expression(node, {*known, *made, *({OWN[kind]} if kind in OWN else ())}, kind)
+        elif kind in PARTS:
+            _part(kind, node, {*known, *made}, made, parameters, where)
+        elif kind == "straight":
+            if node.value not in known:
+                raise node.error(f"straight: a symbol was expected, one of {', '.join(sorted(known))}")
+        elif kind == "exponent":
+            if node.value not in parameters:
+                raise node.error(
+                    f"exponent: a parameter was expected, one of {', '.join(sorted(parameters))}"
+                )
+        else:
+            kinds = (*FORMS, *PARTS, "straight", "exponent")
+            raise node.error(
+                f"'{kind}' is not a change{suggest(kind, kinds)}; one of {', '.join(kinds)} was expected"
+            )
+
+
+def _part(kind: str, node: Node, known: set[str], made: set[str], parameters: set[str], where: str) -> None:
+    section = Section(node, kind)
+    required, others = PARTS[kind]
+    for key in (*required, *others):
+        value = section.get(key, key in required)
+        if value is None:
+            continue
+        if key in ("from", "into"):
+            ends = sorted({*SYMBOLS[where], *made} - {"u", "y"})
+            if value.value not in ends:
+                raise value.error(
+                    f"{kind}: '{value.value}' is not a node of the place; {', '.join(ends) or 'none'} was expected"
+                )
+        elif key in ("rate", "storage") or (key == "initial" and value.value not in _STARTS):
+            _expression(value, known, f"{key} of {kind}")
+        elif key in ("share", "level") and value.value not in parameters:
+            raise value.error(f"{kind}: {key} is a parameter, one of {', '.join(sorted(parameters))}")
+    if kind == "flow" and not {"from", "into"} & set(node.value):
+        raise node.error("flow: 'from' or 'into' was expected")
+    if kind == "node":
+        made.add(section.text("name"))
+    section.end()
