@@ -1,6 +1,6 @@
 """The command `effects check`: mistakes in effect files, each with its place in the file.
 
-An effect that the strict reader of the catalogue takes is put at every place of some plants, where its units are checked.
+An effect that the catalogue's reader takes is put at every place of some plants, where its units are checked.
 """
 
 from __future__ import annotations

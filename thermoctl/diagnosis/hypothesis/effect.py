@@ -1,6 +1,6 @@
 """An effect of the catalogue, and the reader of its file: strict, key by key.
 
-A wrong key, an unknown name in an expression or a change that is none is one error with its place in the file.
+A wrong key, an unknown name in an expression or a wrong change is one error with its place in the file.
 """
 
 from __future__ import annotations
