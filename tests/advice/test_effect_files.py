@@ -92,6 +92,11 @@ def test_the_worked_effect_and_its_mistake_print_as_on_the_page(tmp_path, monkey
             r":7:\d+: parameter 'K': shape 'tau' is none of this effect's shapes \(none\)",
         ),
         ("low: 0}", "low: 0, trial: s3 * q}", r":7:\d+: trial of 'K': 'q' is not known here"),
+        (
+            "W/(unit_of_v)",
+            "W/(unit_of_w)",
+            r":7:\d+: parameter 'K': no unit 'unit_of_w' .*; there are unit_of_y, .*unit_of_T",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_with_its_place(old, new, expected, tmp_path, capsys):

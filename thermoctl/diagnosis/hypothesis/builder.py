@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.hypothesis.effect import Effect, EffectParameter
+from thermoctl.diagnosis.hypothesis.effect import UNITS_OF, Effect, EffectParameter
 from thermoctl.diagnosis.hypothesis.places import ERRORS, Place, heats, outlet
 from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
@@ -134,14 +134,8 @@ class Builder:
             rate = next(
                 (f.unit for f in self.base.flows.values() if node in (f.source, f.target) and f.unit), None
             )
-        known = {
-            "unit_of_y": self._unit_of_y(),
-            "unit_of_rate": rate,
-            "unit_of_v": self._signal_unit(self.symbols.get("v")),
-            "unit_of_x": self._signal_unit(self.symbols.get("x")),
-            "unit_of_u": self._signal_unit(self.symbols.get("u")),
-            "unit_of_a": self._signal_unit(self.symbols.get("a")),
-        }
+        known = {of: self._signal_unit(self.symbols.get(of[-1])) for of in UNITS_OF}
+        known |= {"unit_of_y": self._unit_of_y(), "unit_of_rate": rate}
         for key, unit in known.items():
             if key in text:
                 if unit is None:

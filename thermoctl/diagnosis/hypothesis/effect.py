@@ -60,6 +60,8 @@ SHAPES: Mapping[str, tuple[str, ...]] = {
     "distances": ("distance",),
 }
 """The kinds of shapes, and the names of the values that each gives to parameters and trials."""
+UNITS_OF = ("unit_of_y", "unit_of_rate", *(f"unit_of_{signal}" for signal in "vxuaiT"))
+"""Units of parameters that the place gives: of its reading, its flow, and its signals."""
 FORMS = ("rate", "value", "storage", "drive", "resistance")
 PARTS = {
     "flow": (("rate",), ("from", "into")),
@@ -210,7 +212,12 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
     if not low <= high:  # equal: a known value
         raise p.node.error(f"parameter '{name}': low {low:g} must not be above high {high:g}")
     unit = p.text("unit", "")
-    if unit and not re.search(r"\bunit_of(_\w+)?", unit):
+    for of in re.findall(r"unit_of\w*", unit):
+        if of not in UNITS_OF:
+            raise p.get("unit").error(
+                f"parameter '{name}': no unit '{of}'{suggest(of, UNITS_OF)}; there are {', '.join(UNITS_OF)}"
+            )
+    if unit and "unit_of" not in unit:
         try:
             dimension(unit)
         except ValueError as e:
