@@ -82,6 +82,15 @@ def shared(result: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any
     return {**result, "cases": {k: r for k, r in result["cases"].items() if k in other["cases"]}}
 
 
+def write(rows: Mapping[str, Row], *files: Path) -> dict[str, Any]:
+    """Write and return the result of this commit and day, one line a case."""
+    new = {"commit": commit(), "date": datetime.now(UTC).date().isoformat(), "cases": rows}
+    text = json.dumps(new, indent=None, separators=(",", ":")).replace('},"', '},\n"') + "\n"
+    for path in files:
+        path.write_text(text)
+    return new
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command: 1 when a diagnosis failed."""
     p = argparse.ArgumentParser(prog="python -m tests.truth", description=__doc__.splitlines()[0])
@@ -98,16 +107,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not found:
         say("no case: give --only closed,open, or the folders of the environment")
         return 2
-    new: dict[str, Any] = {
-        "commit": commit(),
-        "date": datetime.now(UTC).date().isoformat(),
-        "cases": judged(found, a.out / "diagnoses", a.workers),
-    }
-    text = (
-        json.dumps(new, indent=None, separators=(",", ":")).replace('},"', '},\n"') + "\n"
-    )  # one line a case
-    for path in (a.out / "result.json", *([a.keep] if a.keep else [])):
-        path.write_text(text)
+    new = write(
+        judged(found, a.out / "diagnoses", a.workers), a.out / "result.json", *([a.keep] if a.keep else [])
+    )
     if a.old.exists():
         old = json.loads(a.old.read_text())
         old, now = shared(old, new), shared(new, old)

@@ -20,8 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.truth.__main__ import GROUPS, cases
-from tests.truth.cases import Case
+from tests.truth.__main__ import GROUPS, cases, write
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import KEPT, kept, sought
 from thermoctl.diagnosis import diagnose as engine
@@ -74,6 +73,14 @@ def _precise(case: Any, f: Any) -> list[float]:
     return [0.0] * len(case.grids)
 
 
+def _all(error: Any) -> float:
+    return float(len(error))
+
+
+def _stated(case: Any, f: Any) -> list[float]:
+    return [float(g.variance) ** 0.5 for g in case.grids]
+
+
 def _fine(case: Any) -> list[bool]:
     return [False] * len(case.grids)
 
@@ -106,6 +113,16 @@ RULES: Mapping[str, Rule] = {
     ),
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
+    ),
+    "only noise": Rule(
+        "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
+    ),
+    "floor": Rule("an error far below the noise is luck", {"verdict.confirm.FLOOR": 1e-6}),
+    "draws": Rule("a smooth error counts as few draws", {"verdict.confirm._draws": _all}),
+    "size": Rule("a size left out may vanish: its prior", {"verdict.confirm.WIDTH": 1e3}),
+    "learnt noise": Rule(
+        "a stated noise may be wrong by two standard deviations of its prior",
+        {"evidence.levels.levels": _stated},
     ),
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
@@ -164,8 +181,8 @@ def _put(path: str, value: Any) -> None:
 
 
 def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, str | None]:
-    """Return the result of one case that is decided without a rule, or what failed."""
-    rule = RULES[name]
+    """Return the result of one case that is decided without a rule ("": with all), or what failed."""
+    rule = RULES.get(name, Rule(""))
     numbers = dataclasses.replace(limits(), **rule.limits)
     with one_thread(), left_out(rule):
         try:
@@ -173,15 +190,6 @@ def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, s
             return contract(engine.decided(dataclasses.replace(found, limits=numbers))), None
         except Exception as e:  # a crash is a result
             return None, f"{type(e).__name__}: {e}"
-
-
-def present(found: Sequence[Case], folder: Path) -> dict[str, Row]:
-    """Judge the kept results with all rules."""
-    rows = {}
-    for c in found:
-        result, run = outcome(c.job, folder)
-        rows[c.job.name] = row(c, result, 0.0, run["error"])
-    return rows
 
 
 def line(what: str, rows: Mapping[str, Row]) -> str:
@@ -206,24 +214,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument(
         "--search", action="store_true", help="the rules of the search: each case is searched again"
     )
+    p.add_argument(
+        "--keep", type=Path, metavar="FILE", help="write the result with all rules, for OLD= of make truth"
+    )
     a = p.parse_args(argv)
     folder = a.out / "diagnoses"
     found = [c for c in cases(a) if (folder / c.job.name / KEPT).exists()]
     if not found:
         print("no kept search: run make truth first", file=sys.stderr)
         return 2
-    base = present(found, folder)
-    groups = [title for g, title in GROUPS.items() if any(r["group"] == g for r in base.values())]
-    print(
-        f"| without | {' | '.join(groups)} |\n{'|---' * (len(groups) + 1)}|\n{line('nothing: all rules', base)}"
-    )
-    changed = {}
+    costs = {c.job.name: float(outcome(c.job, folder)[1].get("cpu_s") or 0.0) for c in found}
+    groups = [title for g, title in GROUPS.items() if any(c.group == g for c in found)]
+    print(f"| without | {' | '.join(groups)} |\n{'|---' * (len(groups) + 1)}|", flush=True)
+    judged: dict[str, dict[str, Row]] = {}
     with ProcessPoolExecutor(a.workers) as pool:
-        for name in a.rules or [n for n, r in RULES.items() if r.searches == a.search]:
+        for name in ("", *(a.rules or [n for n, r in RULES.items() if r.searches == a.search])):
             results = pool.map(without, [name] * len(found), [c.job for c in found], [folder] * len(found))
-            rows = {c.job.name: row(c, *r[:1], 0.0, r[1]) for c, r in zip(found, results, strict=True)}
-            print(line(name, rows), flush=True)
-            changed[name] = changes(base, rows)
+            judged[name] = {
+                c.job.name: row(c, result, costs[c.job.name], error)
+                for c, (result, error) in zip(found, results, strict=True)
+            }
+            print(line(name or "nothing: all rules", judged[name]), flush=True)
+    base = judged.pop("")
+    if a.keep:
+        write(base, a.keep)
+    changed = {name: changes(base, rows) for name, rows in judged.items()}
     for name, of in changed.items():
         print(f"\n{name}: {RULES[name].says}")
         print("\n".join(f"- {case}: *{kind}* {what}" for case, kind, what in of if kind != "verdict"))

@@ -9,7 +9,7 @@ from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
-from thermoctl.diagnosis.evidence.levels import remainder
+from thermoctl.diagnosis.evidence.levels import only_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.hypothesis.catalogue import contained
@@ -107,7 +107,10 @@ def _decided(sought: Sought) -> Diagnosis:
         likeliest = next(keys for keys in posterior.hypotheses if keys)
         stand = supported(likeliest, physics)  # the other effects are part of the remainder
         found = stand if stand in fits else likeliest
-        kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
+        kept = found
+        # of known physics that leaves only noise, no part is a misfit that it imitates
+        if reserve or any(key[0] == LAW for key in found) or not only_noise(known, fits[found], numbers):
+            kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
         best = with_residuals(known, fits[kept]) if kept else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
