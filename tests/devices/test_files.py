@@ -359,3 +359,20 @@ def test_an_eds_without_objects_is_refused(tmp_path):
     tmp_path.joinpath("a.eds").write_text("[FileInfo]\nFileName=x\n")
     with pytest.raises(InputError, match="no EDS file: it has no section of an object"):
         make(tmp_path, HEAD + DRIVE % "", "virtual:x", "{state: amplifier_state}")
+
+
+def test_a_file_is_read_again_when_it_has_changed(tmp_path):
+    """A daemon that reloads its configuration must not keep the profile, DBC or EDS file of its start."""
+    dev = device(tmp_path, START + GOOD, [V], "{v: voltage_v}")
+    assert read(dev, (801, bytes.fromhex("d204") + bytes(6))).value[ROLE["voltage_v"]] == pytest.approx(12.34)
+    dev = device(tmp_path, START + GOOD.replace("(0.01,0)", "(0.02,0)"), [V], "{v: voltage_v}")
+    assert read(dev, (801, bytes.fromhex("d204") + bytes(6))).value[ROLE["voltage_v"]] == pytest.approx(24.68)
+    dev = device(tmp_path, START + GOOD, [V + ", offset: 0.5"], "{v: voltage_v}")
+    assert read(dev, (801, bytes.fromhex("d204") + bytes(6))).value[ROLE["voltage_v"]] == pytest.approx(12.84)
+    path = tmp_path / "a.eds"
+    for number in (6, 7):
+        path.write_text(EDS.replace("0x0006", str(number)))
+        assert read_eds(path).entries[0x6041, 0].data_type == number
+    path.unlink()
+    with pytest.raises(OSError):
+        read_eds(path)

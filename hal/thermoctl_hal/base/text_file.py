@@ -21,19 +21,19 @@ _MARKS = (
 
 
 def while_same(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Let `read` parse a file again only where its time or size has changed; the result is shared."""
+    """Let `read` parse a file again only where its bytes have changed; the result is shared."""
 
     @lru_cache(maxsize=KEPT)
-    def kept(path: Path, stamp: tuple[int, int]) -> T:
+    def kept(path: Path, content: bytes) -> T:
         return read(path)
 
     @wraps(read)
     def call(path: Path) -> T:
         try:
-            found = path.stat()
+            content = path.read_bytes()
         except OSError:
             return read(path)  # raises its own error
-        return kept(path.absolute(), (found.st_mtime_ns, found.st_size))
+        return kept(path, content)
 
     return call
 
