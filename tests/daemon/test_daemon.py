@@ -91,6 +91,35 @@ def test_reload_applies_whole_files_only(daemon):
     assert now["state"] == "ARMED" and now["ticks"] > before and now["setpoint_um"] == 3.0
 
 
+def test_a_reload_that_takes_long_starves_no_watchdog(unrecorded, tmp_path, monkeypatch):
+    """On a loaded machine the answer took longer than systemd's WatchdogSec, which then killed an armed rig."""
+    heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    heard.bind(str(tmp_path / "notify"))
+    heard.settimeout(LIMIT_S)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    daemon = Daemon(unrecorded)
+    try:
+        commands = daemon.child("commands")
+        os.kill(commands, signal.SIGSTOP)  # it answers nothing
+        before = len(psutil.Process(daemon.process.pid).children())
+        daemon.process.send_signal(signal.SIGHUP)
+        wait(lambda: len(psutil.Process(daemon.process.pid).children()) > before, "the reload begins")
+        heard.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while heard.recv(100):
+                pass
+        heard.settimeout(LIMIT_S)
+        fed = 0
+        while fed < 10:
+            fed += heard.recv(100) == b"WATCHDOG=1"
+        assert "thermoctl: reload" not in daemon.log
+        os.kill(commands, signal.SIGCONT)
+        wait(lambda: "thermoctl: reload ok=True" in daemon.log, "the reload")
+    finally:
+        daemon.kill()
+        heard.close()
+
+
 def test_bad_clients_cost_nothing(daemon):
     """Garbage, an endless line, a client that never reads, a flood: answered or dropped, and the loop ticks on."""
     path = daemon.settings.socket.path

@@ -56,6 +56,7 @@ from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import disable_amplifier
 
+RELOAD_S = 30.0  # longest time for a reload on a slow machine
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended
 LOOK_S = 0.1  # time between two checks
@@ -142,6 +143,7 @@ class _Supervision:
         self.axes = list(zip(settings.parts, shared, map(compensator, settings.parts), strict=True))
         self.shared = shared[0]
         self.asked: list[int] = []
+        self.reloading = Child("reload", _reload, settings, log)  # beside this one, which feeds the watchdog
         self.reload_asked: list[int] = []
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda n, _: self.asked.append(n))
@@ -206,9 +208,9 @@ class _Supervision:
         if now - self.kept_at > keep.EVERY_S:
             self.kept_at = now
             self._keep()
-        if self.reload_asked:
+        if self.reload_asked and not self.reloading.alive:
             self.reload_asked.clear()
-            _reload(self.settings, self.log)
+            self.reloading.start()
 
     def _look(self) -> None:
         for watcher in self.watchers:
@@ -233,14 +235,18 @@ class _Supervision:
             safe_amplifier(self.settings, self.log)
         self._look()
         self._keep()
-        for child in self.others:
+        for child in (*self.others, self.reloading):
             child.end()
 
 
-def _reload(settings: Settings, log: Log) -> None:
+def _reload(settings: Settings, log: Log) -> int:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    loops.die_with_parent()
     for part in settings.parts:
         try:
-            answer = ask(part.socket.path, {"command": "reload"})
+            answer = ask(part.socket.path, {"command": "reload"}, RELOAD_S)
             log("reload", axis=part.axis or None, **answer)
         except InputError as e:
             log("reload", axis=part.axis or None, error=e)
+    return EXIT_OK
