@@ -115,6 +115,10 @@ def test_a_reload_that_takes_long_starves_no_watchdog(unrecorded, tmp_path, monk
         assert "thermoctl: reload" not in daemon.log
         os.kill(commands, signal.SIGCONT)
         wait(lambda: "thermoctl: reload ok=True" in daemon.log, "the reload")
+        daemon.process.terminate()  # the end may take longer, too
+        while (said := heard.recv(100)) == b"WATCHDOG=1":
+            pass
+        assert re.fullmatch(rb"STOPPING=1\nWATCHDOG_USEC=\d{8}", said)
     finally:
         daemon.kill()
         heard.close()

@@ -113,7 +113,7 @@ def chain(tmp_path):
 def test_pulled_cable_ends_in_its_fault_and_rearms_without_a_jump(chain, pull, plug, fault):
     chain.arm()
     assert chain.ask("setpoint", 20.0)["ok"]
-    chain.until(lambda s: abs(s["position_um"] - 20) < 1, 30)
+    chain.until(lambda s: s["position_um"] is not None and abs(s["position_um"] - 20) < 1, 30)
     pulled = time.monotonic()
     chain.tell(pull)
     chain.until(lambda s: any(fault in str(f) for f in s["faults"]), 10)

@@ -56,6 +56,7 @@ from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import disable_amplifier
 
+END_S = 60  # longest time for the end: the recorder's last rows on a slow disk
 RELOAD_S = 30.0  # longest time for a reload on a slow machine
 READY_S = 60.0  # time limit of the first tick: devices connect before it
 STALL_S = 1.0  # a loop without a tick for this time, or for protection.late_s if longer, is ended
@@ -228,7 +229,7 @@ class _Supervision:
 
     def _end(self) -> None:
         """End all processes, the loop first; disable the amplifier where the loop did not end well."""
-        self.notify("STOPPING=1")
+        self.notify(f"STOPPING=1\nWATCHDOG_USEC={END_S * 1_000_000}")  # nothing feeds it from here on
         ended_by_itself = not self.loop.alive
         self.loop.end(LOOP_STOP_S)
         if ended_by_itself or self.loop.process.exitcode != 0:
