@@ -31,9 +31,9 @@ import yaml
 from tests.proof.rigs import RIGS, Rig
 from thermoctl.diagnosis.evidence.odds import rare
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue, contained
-from thermoctl.diagnosis.limits import Limits, limits
+from thermoctl.diagnosis.limits import Thresholds, limits
 from thermoctl.diagnosis.search.mistakes import MISTAKES
-from thermoctl.diagnosis.verdict.decide import Key, Posterior, weigh
+from thermoctl.diagnosis.verdict.decide import Key, Probabilities, weigh
 from thermoctl.diagnosis.verdict.misfit import Energy, standing
 from thermoctl.plant import load
 
@@ -67,7 +67,7 @@ class Judged:
     tolerated: frozenset[Key] = frozenset()
 
 
-def judged(plant: Path, result: Path, used: Limits) -> Judged:
+def judged(plant: Path, result: Path, used: Thresholds) -> Judged:
     """Read one result, still without truths; `used`: the numbers that made it."""
     entries = catalogue((CATALOGUE, MISTAKES))
     inputs = load(plant).inputs
@@ -93,13 +93,13 @@ def judged(plant: Path, result: Path, used: Limits) -> Judged:
     )
 
 
-def concealed(case: Path, result: Path, used: Limits) -> Judged:
+def concealed(case: Path, result: Path, used: Thresholds) -> Judged:
     """Read a generated case, its answer and its result."""
     answer = yaml.safe_load((case / "answer.yaml").read_text())
     return dataclasses.replace(judged(case / "plant.yaml", result, used), truths=_truths(answer))
 
 
-def real(rig: Rig, folder: Path, result: Path, used: Limits) -> Judged:
+def real(rig: Rig, folder: Path, result: Path, used: Thresholds) -> Judged:
     """Read the result of a real rig: an accepted effect is right at any place."""
     found = judged(folder / rig.folder / rig.plant, result, used)
     truths = tuple(frozenset(k for k in found.dims if k[0] in names) for names in rig.accepted)
@@ -125,7 +125,7 @@ def _truths(answer: Mapping[str, Any]) -> tuple[frozenset[Key], ...]:
     return tuple(out)
 
 
-def posterior(case: Judged, numbers: Limits) -> Posterior:
+def posterior(case: Judged, numbers: Thresholds) -> Probabilities:
     """Decide a case again with other numbers."""
     physics = standing(case.energy, case.dims, CONTAINS, numbers)
     own = np.log(numbers.missing / (1 - numbers.missing))
@@ -139,7 +139,7 @@ def posterior(case: Judged, numbers: Limits) -> Posterior:
     return weigh(scores, physics, numbers)
 
 
-def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:
+def names(cases: Sequence[Judged], numbers: Thresholds) -> tuple[int, int]:
     """Return the numbers of effects that are named rightly, and falsely."""
     right = false = 0
     for case in cases:
@@ -151,7 +151,7 @@ def names(cases: Sequence[Judged], numbers: Limits) -> tuple[int, int]:
     return right, false
 
 
-def loss(case: Judged, numbers: Limits) -> float:
+def loss(case: Judged, numbers: Thresholds) -> float:
     """Return the mean log loss of one case: of each effect that is there, and of all that are not."""
     effects = posterior(case, numbers).effects
     right = [sum(effects.get(k, 0.0) for k in accepted) for accepted in case.truths]
@@ -163,8 +163,8 @@ def loss(case: Judged, numbers: Limits) -> float:
 
 
 def calibrated(
-    cases: Sequence[Judged], rigs: Sequence[Judged], numbers: Limits
-) -> tuple[Limits, dict[str, tuple[float, float]]]:
+    cases: Sequence[Judged], rigs: Sequence[Judged], numbers: Thresholds
+) -> tuple[Thresholds, dict[str, tuple[float, float]]]:
     """Return the numbers with the best names, and for each the range in which the names are as good."""
     there = [sum(len(c.truths) for c in of) for of in (cases, rigs)]
     tried = {}
@@ -186,7 +186,7 @@ def calibrated(
 
 
 def write(
-    numbers: Limits, ranges: Mapping[str, tuple[float, float]], cases: Sequence[str], n: int, rigs: int
+    numbers: Thresholds, ranges: Mapping[str, tuple[float, float]], cases: Sequence[str], n: int, rigs: int
 ) -> None:
     """Put values and provenance into config/diagnosis.yaml."""
     commit = subprocess.run(

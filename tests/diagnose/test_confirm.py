@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, signed_rank
-from thermoctl.diagnosis.verdict.decide import Posterior
+from thermoctl.diagnosis.verdict.decide import Probabilities
 
 A, B = ("radiation", "block"), ("sensor_drift", "reading")
 NONE, ONE, BOTH = frozenset(), frozenset({A}), frozenset({A, B})
@@ -43,7 +43,7 @@ def test_the_weakest_name_leaves_first_and_the_rest_is_asked_again():
     alone = np.full(8, 2.0)
     beside = alone * np.array([0.1, 1.01, 1.0, 1.02, 1.01, 1.0, 1.03, 1.02])  # it imitates the first part
     test = with_errors({NONE: np.full(8, 50.0) + np.arange(8), ONE: alone, BOTH: beside})
-    posterior = Posterior({BOTH: 1.0}, {A: 1.0, B: 1.0}, 1.0)
+    posterior = Probabilities({BOTH: 1.0}, {A: 1.0, B: 1.0}, 1.0)
     kept, after, asked = confirmed(posterior, BOTH, test, 0.9)
     assert kept == ONE
     assert after.effects[A] > 0.99 and after.effects[B] == asked[B] < 0.9

@@ -21,7 +21,7 @@ import numpy as np
 from tests.laws.rigs import LAWS, RATIOS, RELAYS, STORAGES, Made, Truth, drawn, make
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import law_rate
 from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
@@ -193,7 +193,7 @@ def _memories(plant: Plant, trajectory: dict[str, Any], t: np.ndarray) -> dict[s
     return dict(zip(own, model.run(model.excitation(Table("truth", "", t, columns))).x.T, strict=True))
 
 
-def _variables(law: Law, made: Made) -> set[str]:
+def _variables(law: FoundLaw, made: Made) -> set[str]:
     """The signals of the terms that matter, without the ambient."""
     model = compile_plant(made.plant)
     d = model.excitation(made.tables[0])

@@ -15,7 +15,7 @@ from thermoctl import __version__
 from thermoctl.diagnosis import diagnose as engine
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.limits import Limits, limits
+from thermoctl.diagnosis.limits import Thresholds, limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.fleet.jobs import Job, Run
@@ -60,7 +60,7 @@ def _result(job: Job, path: Path) -> dict[str, Any]:
     return result
 
 
-def sought(job: Job, numbers: Limits) -> engine.Sought:
+def sought(job: Job, numbers: Thresholds) -> engine.Sought:
     """Return the search of a job. Raises InputError, SimulationError."""
     plant = load(job.plant)
     tables, apart = (read_recordings(plant, files) for files in (job.recordings, job.held_out))

@@ -15,15 +15,15 @@ from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.hypothesis.catalogue import contained
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
-from thermoctl.diagnosis.law.find import Law, found_law
+from thermoctl.diagnosis.law.find import FoundLaw, found_law
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.smooth import missing_flow
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import Keys, Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
-from thermoctl.diagnosis.verdict.decide import Decision, Facts, Posterior, decide, weigh
+from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
 from thermoctl.diagnosis.verdict.misfit import energies, standing, supported
 from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
@@ -40,7 +40,7 @@ class Sought:
 
     case: Case
     searched: Searched
-    limits: Limits
+    limits: Thresholds
     reserve: tuple[Table, ...]
     unsure: bool
 
@@ -50,7 +50,7 @@ def diagnose(
     plant: Plant,
     tables: Sequence[Table],
     entries: Mapping[str, Effect],
-    numbers: Limits,
+    numbers: Thresholds,
     held_out: Sequence[Table] = (),
     progress: Callable[[str], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -71,7 +71,7 @@ def sought(
     plant: Plant,
     tables: Sequence[Table],
     entries: Mapping[str, Effect],
-    numbers: Limits,
+    numbers: Thresholds,
     held_out: Sequence[Table] = (),
     say: Callable[[str], None] = lambda text: None,
     stopped: Callable[[], bool] = lambda: False,
@@ -163,9 +163,9 @@ def _law(
     tried: Mapping[Keys, Weighed],
     best: Fitted,
     decision: Decision,
-    posterior: Posterior,
+    posterior: Probabilities,
     asked: Mapping[Key, float],
-) -> Law | None:
+) -> FoundLaw | None:
     """Return the law among the names, with its gain over the best hypothesis without it."""
     key = next((key for key in decision.named if key[0] == LAW), None)
     if key is None:

@@ -9,7 +9,7 @@ from thermoctl.shipped import shipped
 
 
 @dataclass(frozen=True)
-class Limits:
+class Thresholds:
     """Meanings and provenance: config/diagnosis.yaml."""
 
     beam: int
@@ -25,10 +25,10 @@ class Limits:
     alike: float
 
 
-def limits() -> Limits:
+def limits() -> Thresholds:
     """Read the shipped numbers. Raises InputError where one is missing or not known."""
     root = yamlfile.load(shipped("config") / "diagnosis.yaml")
-    known = {f.name for f in fields(Limits)}
+    known = {f.name for f in fields(Thresholds)}
     for key, node in root.value.items():
         if key not in known:
             raise node.error(
@@ -37,4 +37,4 @@ def limits() -> Limits:
     values = {key: node.plain()["value"] for key, node in root.value.items()}
     for key in known - values.keys():
         raise root.error(f"the number '{key}' is missing")
-    return Limits(**values)
+    return Thresholds(**values)

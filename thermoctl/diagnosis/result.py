@@ -16,13 +16,13 @@ from thermoctl.diagnosis.evidence.held_out import Worth
 from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import PlacedLaw
 from thermoctl.diagnosis.law.result import law_entry
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.search.beam import Searched
-from thermoctl.diagnosis.verdict.decide import Decision, Posterior
+from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
 from thermoctl.plant import expression as ex
@@ -60,7 +60,7 @@ class Diagnosis:
 
     case: Case
     searched: Searched
-    posterior: Posterior
+    posterior: Probabilities
     best: Fitted
     null: Fitted
     left: Left
@@ -73,7 +73,7 @@ class Diagnosis:
     asked: Mapping[Key, float]
     families: tuple[Family, ...] = ()
     missing_flow: float | None = None
-    law: Law | None = None
+    law: FoundLaw | None = None
 
     @property
     def shown(self) -> tuple[Placed, ...]:

@@ -15,7 +15,7 @@ from thermoctl.diagnosis import diagnose as engine
 from thermoctl.diagnosis.data import memory
 from thermoctl.diagnosis.evidence.fit import remembered
 from thermoctl.diagnosis.experiment import file as experiment_file
-from thermoctl.diagnosis.experiment.design import NONE, Limits
+from thermoctl.diagnosis.experiment.design import NONE, Ranges
 from thermoctl.diagnosis.experiment.propose import propose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits as numbers
@@ -50,7 +50,7 @@ def diagnose(
     held_out: Sequence[Table] = (),
     progress: Callable[[str], None] | None = None,
     drivable: Sequence[str] = (),
-    limits: Limits = NONE,
+    limits: Ranges = NONE,
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
     report: bool = True,

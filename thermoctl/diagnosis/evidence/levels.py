@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.grids import Grid
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 
 PRESENT = 0.5  # probability of a remainder, from which an output's residual holds one
 RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
@@ -90,7 +90,7 @@ def over_noise(case: Case, f: Fitted) -> list[float]:
     return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f), strict=True)]
 
 
-def only_noise(case: Case, f: Fitted, limits: Limits) -> bool:
+def only_noise(case: Case, f: Fitted, limits: Thresholds) -> bool:
     """Is the residual about as large as the noise, and no remainder in it certain?"""
     return max(over_noise(case, f)) <= limits.clean and remainder(case, f) < limits.name
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 
 
-def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Limits) -> float:
+def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thresholds) -> float:
     """Return the log prior odds of a hypothesis against no effect.
 
     The odds are shared equally among the entries, and each entry's among its places."""

@@ -24,8 +24,8 @@ SURROUNDINGS = ("K", "W/m^2", "Pa")  # dimensions of temperature, sunshine and p
 LENGTHS = (1.0, 0.5, 2.0)  # of an experiment, in recordings' lengths
 STARTS_APART = 0.05  # share by which a constant input differs between recordings that count as two starts
 
-Limits = Mapping[str, tuple[float, float]]
-NONE: Limits = {}
+Ranges = Mapping[str, tuple[float, float]]
+NONE: Ranges = {}
 Plateaus = list[tuple[float, float]]  # (duration in s, value) of each plateau
 
 
@@ -66,7 +66,7 @@ class Excitation:
 
 
 def levers(
-    plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Limits = NONE
+    plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Ranges = NONE
 ) -> list[Lever]:
     """Find the inputs that moved in the recordings and can be commanded.
 
@@ -113,7 +113,7 @@ def _together(a: np.ndarray, b: np.ndarray) -> bool:
     return both is not None and bool(abs(np.corrcoef(a[both], b[both])[0, 1]) > TOGETHER)
 
 
-def _lever(name: str, column: str, tables: Sequence[Table], limits: Limits) -> Lever:
+def _lever(name: str, column: str, tables: Sequence[Table], limits: Ranges) -> Lever:
     parts = [(t.t, t.columns[column]) for t in tables if column in t.columns]
     finite = [v[np.isfinite(v)] for _, v in parts if np.isfinite(v).any()]
     good = np.concatenate(finite)

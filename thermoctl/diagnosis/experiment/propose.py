@@ -27,7 +27,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, with_residuals
-from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Limits, family, levers
+from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, family, levers
 from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.law.result import described
@@ -212,7 +212,7 @@ class _Trial:
 class _Comparison:
     """The hypotheses of an undecided diagnosis, and what an experiment would tell between them."""
 
-    def __init__(self, case: Case, standing: Sequence[Standing], limits: Limits):
+    def __init__(self, case: Case, standing: Sequence[Standing], limits: Ranges):
         self.case, self.limits = case, limits
         self.predictors = [_predictor(f, p, label) for f, p, label in standing]
         weights = np.array([b.weight for b in self.predictors])
@@ -268,7 +268,7 @@ class _Comparison:
 def propose(
     found: Diagnosis,
     drivable: Sequence[str] = (),
-    limits: Limits = NONE,
+    limits: Ranges = NONE,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.

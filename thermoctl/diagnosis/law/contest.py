@@ -19,13 +19,13 @@ from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.propose import Proposal, propose_laws
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.plant.simulate import SimulationError
 
 
 def with_laws(
-    case: Case, found: Searched, limits: Limits, say: Callable[[str], None] = lambda text: None
+    case: Case, found: Searched, limits: Thresholds, say: Callable[[str], None] = lambda text: None
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
@@ -53,7 +53,7 @@ def with_laws(
 
 
 def _laws(
-    case: Case, parent: Weighed, ahead: float, limits: Limits, say: Callable[[str], None]
+    case: Case, parent: Weighed, ahead: float, limits: Thresholds, say: Callable[[str], None]
 ) -> list[Weighed]:
     """Return a hypothesis with the best law at each place.
 
@@ -82,7 +82,7 @@ def _laws(
     ]
 
 
-def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Limits) -> Weighed:
+def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
     """Return the likeliest of the laws at one place; with others that fit about as well."""
     share = softmax(np.array([w.score for _, w in found]) / limits.temperature)
     order = np.argsort(-share, kind="stable")

@@ -29,7 +29,7 @@ Tried = tuple[Proposal, Fitted]
 
 
 @dataclass(frozen=True)
-class Law:
+class FoundLaw:
     """A law that a diagnosis found.
 
     - `fitted`: the hypothesis with it, and perhaps with effects of the catalogue
@@ -68,14 +68,14 @@ class Law:
 
 def found_law(
     case: Case, f: Fitted, parent: Fitted, gain: float, probability: float, confirmed: float
-) -> Law | None:
+) -> FoundLaw | None:
     """Return the law of a hypothesis, None where it has none. `parent`: the hypothesis without it."""
     law = law_of(f)
     if law is None:
         return None
     p = law.proposal
     drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f), f.plant)
-    return Law(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
+    return FoundLaw(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
 
 
 def refits(

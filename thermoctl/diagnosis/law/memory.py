@@ -26,7 +26,7 @@ Along = Callable[[np.ndarray, np.ndarray, Shapes, float], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Memory:
+class SignalMemory:
     """A memory m of a signal z.
 
     - `rate`: dm/dt, of z, m, the form's shapes, `duration` (of the longest run) and `sample`, s
@@ -63,11 +63,11 @@ def _relay(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.
 
 
 MEMORIES = {
-    "lag": Memory("(z - m) / tau", "0", 0.1, "{z}, delayed by a first-order lag of {tau}", _lag),
-    "total": Memory(
+    "lag": SignalMemory("(z - m) / tau", "0", 0.1, "{z}, delayed by a first-order lag of {tau}", _lag),
+    "total": SignalMemory(
         "z / duration", "0", 0.1, "the integral of {z} since the start, over {duration} s", _total
     ),
-    "relay": Memory(
+    "relay": SignalMemory(
         "((1 + tanh(6 * (z - 0.5 * (on + off)) / (on - off) + 10 * (m - 0.5))) / 2 - m) / sample",
         "0.5",
         None,

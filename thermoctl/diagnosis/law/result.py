@@ -12,7 +12,7 @@ import yaml
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.held_out import Worth
 from thermoctl.diagnosis.hypothesis.rig import zero_of
-from thermoctl.diagnosis.law.find import Law
+from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import equation, law_rate
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
@@ -27,7 +27,7 @@ from thermoctl.yamlfile import InputError
 EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 
 
-def law_entry(law: Law | None, worth: Worth) -> dict[str, Any] | None:
+def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
     """Return `remainder.law` of diagnosis.json."""
     if law is None:
         return None
@@ -67,7 +67,7 @@ def _terms(p: Proposal) -> list[dict[str, Any]]:
     ]
 
 
-def _parameters(law: Law) -> dict[str, Any]:
+def _parameters(law: FoundLaw) -> dict[str, Any]:
     c, plant = law.placed.candidate, law.fitted.plant
     used = {q.name: c.own(q.name) for q in c.effect.parameters if c.own(q.name) in plant.parameters}
     return {
@@ -80,7 +80,7 @@ def _parameters(law: Law) -> dict[str, Any]:
     }
 
 
-def family(law: Law) -> list[str]:
+def family(law: FoundLaw) -> list[str]:
     """Return what the recordings leave open: the exponents within 95 %, and laws that fit about as well."""
     out = []
     c, plant = law.placed.candidate, law.fitted.plant
@@ -102,7 +102,7 @@ def described(p: Proposal, f: Fitted) -> str:
     return f"{equation(law_rate(f), f)} at {p.place.where}"
 
 
-def law_section(law: Law | None, entry: Mapping[str, Any] | None) -> str:
+def law_section(law: FoundLaw | None, entry: Mapping[str, Any] | None) -> str:
     """Return the report's section: the law, its parameters, its family, and the curve with its band."""
     if law is None or entry is None:
         return ""
@@ -115,7 +115,7 @@ def law_section(law: Law | None, entry: Mapping[str, Any] | None) -> str:
     return body + _drawing(law) + saved
 
 
-def _drawing(law: Law) -> str:
+def _drawing(law: FoundLaw) -> str:
     c = law.curve
     if c is None:
         return ""
@@ -136,7 +136,7 @@ def _drawing(law: Law) -> str:
 # ------------------------------------------------------------------------------------------------ effect file
 
 
-def effect_file(law: Law) -> dict[str, Any]:
+def effect_file(law: FoundLaw) -> dict[str, Any]:
     """Return the content of an effect file: sizes are fitted again, shapes start at the values found here."""
     c, plant = law.placed.candidate, law.fitted.plant
     where, swap = _symbols(law, plant)
@@ -203,7 +203,7 @@ def _ends(where: str) -> dict[str, str]:
     return {"target": symbol, "source": "m"} if where == "node_pair" else {"target": symbol}
 
 
-def _symbols(law: Law, plant: Plant) -> tuple[str, Any]:
+def _symbols(law: FoundLaw, plant: Plant) -> tuple[str, Any]:
     """Return the kind of place, and the change of the plant's names to the symbols of an effect file."""
     place, rig = law.proposal.place, law.placed.candidate.rig
     target, symbols = place.target, dict[str, Expr]()

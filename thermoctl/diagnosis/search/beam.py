@@ -16,7 +16,7 @@ from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.extend import extend, sticking, weaker
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
@@ -77,7 +77,7 @@ class Search:
     """A search under way: where each effect fits, hypotheses by their effects, and those already extended."""
 
     case: Case
-    limits: Limits
+    limits: Thresholds
     where: Mapping[str, set[str]]
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
@@ -121,7 +121,7 @@ class Search:
         return Weighed(f, odds(f.hypothesis.effects, self.where, self.limits))
 
 
-def search(case: Case, limits: Limits) -> Searched:
+def search(case: Case, limits: Thresholds) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
     Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
@@ -149,7 +149,7 @@ def searched(s: Search) -> Searched:
     )
 
 
-def started(case: Case, limits: Limits) -> Search:
+def started(case: Case, limits: Thresholds) -> Search:
     """Return a search that holds the plant without effects."""
     s = Search(case, limits, places(case))
     s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
@@ -297,7 +297,7 @@ def recall(s: Search) -> None:
                 s.keep([found])
 
 
-def leaders(tried: Sequence[Weighed], limits: Limits) -> list[Weighed]:
+def leaders(tried: Sequence[Weighed], limits: Thresholds) -> list[Weighed]:
     """Return the beam: hypotheses in turn by score and by free-run error.
 
     By error too: the remainder may absorb an effect that a later extension explains."""
@@ -364,7 +364,9 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
 
-def _expected(case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Limits, untried: float) -> float:
+def _expected(
+    case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Thresholds, untried: float
+) -> float:
     """Return how many hypotheses the search will probably extend besides; it steers nothing.
 
     `untried`: share of the shortlist."""

@@ -16,7 +16,7 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Absorbed, Metric, Pushed, without
 from thermoctl.diagnosis.search.screen import Norms, screen
@@ -228,7 +228,7 @@ class Screened:
     norms: list[Norms]
 
 
-def screened(case: Case, fitted: Fitted, limits: Limits) -> Screened:
+def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
     """Screen the catalogue at the places of the original plant; a part that an effect added is no place.
 
     Where the residual is more than noise, in the noise alone, too: there by energy."""

@@ -11,7 +11,7 @@ from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.places import PLACES
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.screening import Screened
@@ -56,7 +56,7 @@ def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
 
 
 def shortlist(
-    looked: Screened, where: Mapping[str, set[str]], limits: Limits
+    looked: Screened, where: Mapping[str, set[str]], limits: Thresholds
 ) -> list[tuple[tuple[Direction, ...], float]]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
@@ -86,7 +86,7 @@ def largest(looked: Screened) -> list[Direction]:
     return [dataclasses.replace(d, vector=None) for d in best]
 
 
-def pairs(directions: Sequence[Direction], metric: Metric, limits: Limits) -> list[tuple[Direction, ...]]:
+def pairs(directions: Sequence[Direction], metric: Metric, limits: Thresholds) -> list[tuple[Direction, ...]]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
     The plant's own parameters may imitate each alone, but not both together."""

@@ -27,11 +27,10 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.coordinates import FEWEST
 from thermoctl.diagnosis.evidence.fit import UNIFORM, Fitted, as_refitted
 from thermoctl.diagnosis.evidence.held_out import errors_aside
-from thermoctl.diagnosis.evidence.posterior import Posterior as LogPosterior
-from thermoctl.diagnosis.evidence.posterior import gaussian
+from thermoctl.diagnosis.evidence.posterior import Posterior, gaussian
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.search.beam import Keys
-from thermoctl.diagnosis.verdict.decide import Posterior
+from thermoctl.diagnosis.verdict.decide import Probabilities
 from thermoctl.plant.climb import bounded_step
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
@@ -51,7 +50,7 @@ class Blocks:
     Raises SimulationError."""
 
     def __init__(self, case: Case, f: Fitted):
-        log = LogPosterior(case, f.plant, f.hypothesis.effects)
+        log = Posterior(case, f.plant, f.hypothesis.effects)
         problem, self.z = log.problem, f.fit.z
         values, dx0 = problem.unpack(self.z)
         sigma = np.array([n.sigma for n in case.noise])
@@ -83,7 +82,7 @@ class Blocks:
         rows = self.count.sum(axis=(0, 1))
         self.share = np.minimum(draws, rows) / np.maximum(rows, 1.0)
 
-    def _believed(self, log: LogPosterior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _believed(self, log: Posterior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return precision (k, k) and gradient at z (k,) of the prior, as one Gaussian.
 
         A size lies about none, so that an effect may vanish where the other parts do not need it."""
@@ -230,8 +229,8 @@ def _fitted(b: Blocks) -> np.ndarray:
 
 
 def confirmed(
-    posterior: Posterior, best: Keys, test: Confirm, name: float
-) -> tuple[Keys, Posterior, dict[Key, float]]:
+    posterior: Probabilities, best: Keys, test: Confirm, name: float
+) -> tuple[Keys, Probabilities, dict[Key, float]]:
     """Return the effects of a hypothesis that stay, the posterior, and the probability of each test.
 
     An effect below `name` leaves, the weakest first; then the rest is asked again."""

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 
 
 @dataclass(frozen=True)
-class Posterior:
+class Probabilities:
     """Probability of each hypothesis tried (by its effects), and of each effect.
 
     `something`: that some effect or law is there"""
@@ -60,8 +60,8 @@ class Decision:
 def weigh(
     scores: Mapping[frozenset[Key], float],
     physics: Mapping[frozenset[Key], Mapping[Key, float]],
-    limits: Limits,
-) -> Posterior:
+    limits: Thresholds,
+) -> Probabilities:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
     `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
@@ -77,15 +77,15 @@ def weigh(
         something += q * max(physics[keys].values(), default=0.0)
         for key in keys:
             effects[key] = effects.get(key, 0.0) + q * physics[keys][key]
-    return Posterior(hypotheses, effects, something)
+    return Probabilities(hypotheses, effects, something)
 
 
-def _only_noise(f: Facts, limits: Limits) -> bool:
+def _only_noise(f: Facts, limits: Thresholds) -> bool:
     """Is the residual about as large as the noise, and neither a remainder nor an unknown flow certain?"""
     return f.over_noise <= limits.clean and max(f.remains, f.flow) < limits.name
 
 
-ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
+ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
     (
         "nothing is supported for sure and the residual is the sensors' noise",
         lambda f, q: f.something < q.name and _only_noise(f, q),
@@ -108,7 +108,7 @@ ROWS: tuple[tuple[str, Callable[[Facts, Limits], bool], str], ...] = (
 )
 
 
-def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
+def decide(posterior: Probabilities, facts: Facts, limits: Thresholds) -> Decision:
     """The first row that holds."""
     row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
     numbers = {
@@ -125,7 +125,9 @@ def decide(posterior: Posterior, facts: Facts, limits: Limits) -> Decision:
     return Decision(verdict, named, alternatives(posterior, named, limits), row, numbers)
 
 
-def alternatives(posterior: Posterior, named: Sequence[Key], limits: Limits) -> tuple[tuple[Key, float], ...]:
+def alternatives(
+    posterior: Probabilities, named: Sequence[Key], limits: Thresholds
+) -> tuple[tuple[Key, float], ...]:
     """Return the other effects of the likeliest hypotheses that together reach probability `limits.set`."""
     total, found = 0.0, set[Key]()
     for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):

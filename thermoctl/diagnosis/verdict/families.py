@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.verdict.decide import Posterior
+from thermoctl.diagnosis.verdict.decide import Probabilities
 
 MEMBER = 0.02  # probability from which an effect is a member
 
@@ -24,7 +24,7 @@ class Family:
 
 
 def families(
-    posterior: Posterior,
+    posterior: Probabilities,
     physics: Mapping[frozenset[Key], Mapping[Key, float]],
     named: Sequence[Key],
     entries: Mapping[str, Effect],

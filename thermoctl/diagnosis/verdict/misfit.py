@@ -24,7 +24,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted
 from thermoctl.diagnosis.evidence.levels import rounded, timing
 from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import Searched
 
 MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
@@ -49,7 +49,7 @@ def standing(
     energy: Mapping[frozenset[Key], Energy],
     dims: Mapping[Key, int],
     contains: Mapping[str, str],
-    limits: Limits,
+    limits: Thresholds,
 ) -> dict[frozenset[Key], dict[Key, float]]:
     """Return the hypotheses of which an effect stands out of the misfit: the probability of each.
 
@@ -81,7 +81,7 @@ def _is_simpler(
     energy: Mapping[frozenset[Key], Energy],
     dims: Mapping[Key, int],
     contains: Mapping[str, str],
-    limits: Limits,
+    limits: Thresholds,
 ) -> bool:
     """Return whether an effect of a hypothesis is the simpler one that it contains, and a misfit."""
     effect, where = key
@@ -127,7 +127,7 @@ def physics(without: Energy, beside: Energy, share: float) -> float:
     return float(odds / (1 + odds))
 
 
-def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozenset[Key], Energy]:
+def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[frozenset[Key], Energy]:
     """Return the energies of all hypotheses.
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
@@ -144,7 +144,7 @@ def energies(case: Case, searched: Searched, limits: Limits) -> Mapping[frozense
     return out
 
 
-def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: Limits) -> Energy:
+def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: Thresholds) -> Energy:
     """Return the energies of a refit.
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""

@@ -27,7 +27,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, as_weighed
 from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.evidence.where import signals, typical_flow, typical_rate
 from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
-from thermoctl.diagnosis.limits import Limits
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
@@ -45,7 +45,7 @@ class Missing:
     node: str | None = None
     sentence: str = ""
 
-    def told(self, verdict: str, limits: Limits) -> str:
+    def told(self, verdict: str, limits: Thresholds) -> str:
         """Return the sentence, if it is certain, or beside effects that are not certain either."""
         if self.probability >= limits.name:
             return self.sentence
@@ -54,7 +54,7 @@ class Missing:
         return ""
 
 
-def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Limits) -> Missing:
+def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Thresholds) -> Missing:
     """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
 
     Its prior odds are those of a piece of physics, and of an unknown function of time."""
