@@ -41,7 +41,7 @@ class Rule:
 
     says: str
     without: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, Any] = field(default_factory=dict)
     searches: bool = False
 
 

@@ -22,11 +22,10 @@ from thermoctl.checks import Finding
 from thermoctl.checks.model import plant_findings, rates_of
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import UNIFORM, as_refitted, fitted
-from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Limits, courses, family, levers
-from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, courses, family, levers
+from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
-from thermoctl.diagnosis.verdict.decide import Key
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.residuals import Problem
@@ -81,7 +80,7 @@ class Planned:
 
 
 def plan(
-    plant: Plant, tables: Sequence[Table], effects: Mapping[str, Effect], limits: Limits = NONE
+    plant: Plant, tables: Sequence[Table], effects: Mapping[str, Effect], limits: Ranges = NONE
 ) -> Planned:
     """Say what a diagnosis could see in recordings with these inputs and sampling times. Raises InputError.
 
@@ -116,7 +115,7 @@ def _at_rest(plant: Plant, effects: Mapping[str, Effect], seen: set[Key]) -> lis
     return [Visible(c, "", None, np.inf, NOT_EXCITED) for c in found.values()]
 
 
-def _course(model: Model, limits: Limits) -> Table:
+def _course(model: Model, limits: Ranges) -> Table:
     """Return the inputs of an experiment by levels, long enough for the slowest time constant."""
     plant = model.plant
     for name in limits:
@@ -185,7 +184,7 @@ def parameters(model: Model, tables: Sequence[Table]) -> list[Parameter]:
     return list(found.values())
 
 
-def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Limits) -> Course | None:
+def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Ranges) -> Course | None:
     """Return the course of the driven inputs that gives the parameters best; None if this one does.
 
     It is one of the next experiment's family (diagnosis/experiment/design.py), as long as one recording.

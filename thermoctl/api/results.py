@@ -15,7 +15,8 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import over_time
-from thermoctl.diagnosis.report.words import chance, words
+from thermoctl.diagnosis.report.figures import chance
+from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis as Found
 from thermoctl.diagnosis.result import contract
 from thermoctl.plant import save

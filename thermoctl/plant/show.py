@@ -11,7 +11,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from rich.table import Table
@@ -190,8 +190,9 @@ _PAD = {True: 0.35, False: 0.2}  # of a node's box, and of another one, in lette
 def _size(text: Text, canvas: FigureCanvasAgg, inch: float) -> np.ndarray:
     """Return width and height (2,) of a text with its box, in inches."""
     box = text.get_bbox_patch()
-    pad = 2 * text.get_fontsize() / 72 * (box.get_boxstyle().pad if box else 0.1)
-    found = text.get_window_extent(canvas.get_renderer())
+    style: Any = box.get_boxstyle() if box else None
+    pad = 2 * float(text.get_fontsize()) / 72 * (style.pad if style else 0.1)
+    found = text.get_window_extent(cast(Any, canvas).get_renderer())
     return np.array([found.width, found.height]) / inch + pad
 
 

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ _VARIABLES = {
 _STYLE = Path(__file__).with_name("style.css")
 _NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·–]*$")
 _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
-_TEXT = {  # of figures: one size of letters, no frame
+_TEXT: Any = {  # of figures: one size of letters, no frame
     "font.size": 9,
     **dict.fromkeys(
         ("axes.titlesize", "axes.labelsize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 9
@@ -111,7 +111,7 @@ def unit(name: str | None) -> str:
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
-def sheet(width: float, height: float, *panels: int, **how: object) -> tuple[Figure, list[Axes]]:
+def sheet(width: float, height: float, *panels: int, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a matplotlib Figure in the pages' style, sizes in inches, and its panels (rows, columns)."""
     import matplotlib
     from matplotlib.figure import Figure

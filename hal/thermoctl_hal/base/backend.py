@@ -99,3 +99,13 @@ class Backend(Protocol):
 
     def counters(self) -> dict[str, int]:
         """Return counts since the start by name: lost frames, failed checksums, reconnections."""
+
+
+class Pacing(Protocol):
+    """Two further methods of back ends of real devices, for `loop.pace: device`."""
+
+    def check_pacing(self) -> None:
+        """Raise InputError when no device of the rig can start the ticks."""
+
+    def wait_frame(self, due_ns: int, until_ns: int) -> None:
+        """Wait for a whole frame of the position's device; while it is lost, only until `due_ns`."""

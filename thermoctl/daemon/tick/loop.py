@@ -17,7 +17,7 @@ import gc
 import os
 import signal
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from thermoctl.daemon.tick.shared import LOOP_PID, START_S, Shared
 from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.rig.signals import AT as SIGNAL_AT
 from thermoctl.rig.signals import of_channels
-from thermoctl_hal.base.backend import ABSENT, Backend
+from thermoctl_hal.base.backend import ABSENT, Backend, Pacing
 from thermoctl_hal.rig.devices import DevicesBackend
 
 RELOAD = float(len(arming.COMMANDS))
@@ -80,7 +80,7 @@ class Axis:
     ):
         self.backend, self.publish_row, self.mailbox = backend, publish, mailbox
         self.parameter_box, self.state_box, self.start_s = parameter_box, state_box, start_s
-        self.law = Law(model, parameters, period_s)
+        self.law: Any = Law(model, parameters, period_s)  # its state is declared in law.pxd only
         self.reading: Any = None
         self.channels, self._n = channels, len(channels.names)
         self.row = self._head = np.zeros(len(of_channels(channels)))
@@ -246,10 +246,10 @@ def run_loop(
     further: the other axes; they tick after the first one, with its time and step.
     """
     period_ns, spin_ns = round(settings.loop.period_s * 1e9), round(settings.loop.spin_s * 1e9)
-    paced = settings.loop.pace == "device"
+    paced, device = settings.loop.pace == "device", cast(Pacing, rig.backend)
     counted = settings.loop.pace == "tick"
     if paced:
-        rig.backend.check_pacing()
+        device.check_pacing()
     for s in [shared, *[s for _, s in further]]:
         s.counters[START_S], s.counters[LOOP_PID] = rig.start_s, os.getpid()
     before = now_ns()
@@ -258,7 +258,7 @@ def run_loop(
     while not stopping():
         if paced:  # a late frame delays the tick, but by less than two periods
             sleep_until(before + period_ns // 2)
-            rig.backend.wait_frame(deadline, deadline + period_ns)
+            device.wait_frame(deadline, deadline + period_ns)
             now = now_ns()
             deadline = min(deadline, now)
         else:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 Result = Mapping[str, Any]  # the content of diagnosis.json
-Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]  # heads, rows
+Rows = tuple[tuple[str, ...], Sequence[tuple[str, ...]]]  # heads, rows
 
 NONE = "–"
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
