@@ -219,6 +219,7 @@ def _pint() -> tuple[Callable[[str], Mapping[str, Any]], tuple[type[Exception], 
 
 
 def times(a: Dimension, b: Dimension, sign: int = 1) -> Dimension:
+    """Return the dimension of a product, or with sign -1 of a quotient."""
     total = dict(a)
     for base, exponent in b:
         total[base] = total.get(base, Fraction(0)) + sign * exponent
@@ -226,6 +227,7 @@ def times(a: Dimension, b: Dimension, sign: int = 1) -> Dimension:
 
 
 def raised(base: Dimension, exponent: float) -> Dimension:
+    """Return the dimension of a power. Raises ValueError for an exponent beyond _MAX_EXPONENT."""
     if not abs(exponent) <= _MAX_EXPONENT:
         raise ValueError(f"the exponent {exponent:g} is beyond {_MAX_EXPONENT}")
     k = Fraction(exponent).limit_denominator(10_000)
