@@ -24,7 +24,7 @@ from thermoctl.diagnosis.report.figures import (
     short,
     with_interval,
 )
-from thermoctl.diagnosis.report.words import sentences, what_next, words
+from thermoctl.diagnosis.report.words import name, sentences, what_next, words
 from thermoctl.diagnosis.result import unfinished
 
 sizes = st.floats(-7, 5).map(lambda power: 10.0**power)
@@ -145,9 +145,9 @@ def test_an_error_falls_or_rises_as_its_numbers_do(found):
 def test_a_remainder_has_a_size_and_its_measure_beside_it(found):
     text = " ".join(sentences(found))
     rows = {o.name: o for o in outputs(found)}
-    for size, name in re.findall(rf"{NUMBER}(?: \w+)? of (\w+) remains that nothing known explains", text):
-        assert float(size) > 0 and f"beside {number(rows[name].noise)}" in text
-        assert ("and steps of" in text) is (rows[name].left < rows[name].step)
+    for size, output in re.findall(rf"{NUMBER}(?: \w+)? of (\w+) remains that nothing known explains", text):
+        assert float(size) > 0 and f"beside {number(rows[output].noise)}" in text
+        assert ("and steps of" in text) is (rows[output].left < rows[output].step)
     if "no larger than its noise" in text:
         assert all((o.over_noise or 0) <= 1 for o in rows.values()) and found["decision"]["remains"] >= 0.5
     if found["verdict"] in ("explained", "consistent"):
@@ -309,3 +309,10 @@ def test_every_result_is_printed(found):
         summary(found, "out")
     assert what_next(found)[:30] in out.getvalue().replace("\n", " ") and explain(found)
     assert all(chance(a["probability"]) in out.getvalue() for a in found["alternatives"])
+
+
+@pytest.mark.parametrize(("end", "text"), [(899.5, "from 499.5 s to 899.5 s"), (1600.0, "from 499.5 s on")])
+def test_an_effect_that_ends_says_when(end, text):
+    times = {"T0": {"value": 499.5, "sd": 1.0, "unit": "s"}, "T1": {"value": 899.5, "sd": 1.0, "unit": "s"}}
+    lamp = {"effect": "heat_source", "where": "two", "when": [[499.5, end]], "parameters": times}
+    assert name(lamp) == f"heat source {text} at two"
