@@ -135,16 +135,17 @@ def _worth(result: Mapping[str, Any]) -> str:
 def _remains(drawn: Sequence[Curve], result: Mapping[str, Any]) -> str:
     key = "after" if figures.extends(result) else "refit_only"
     rows = {o.name: o for o in outputs(result)}
-    over = sorted(rows, key=lambda n: -rows[n].over("after"))
-    firsts = [next((c for c in drawn if c.output == n and key in c.errors), None) for n in over]
+    names = dict.fromkeys(c.output for c in drawn if c.output in rows and key in c.errors)
+    over = sorted(names, key=lambda n: -round(rows[n].over(key), 1))
+    firsts = [next(c for c in drawn if c.output == n and key in c.errors) for n in over]
     body = ""
-    for k, c in enumerate(filter(None, firsts)):
+    for k, c in enumerate(firsts):
         held = "held-out " if c.held_out else ""
         text = f"The {held}error of {c.output} in {c.recording}. Noise alone stays between the dashed lines, 19 times in 20."
         part = remaining(c, key, rows[c.output].noise, text)
         body += folded(f"The same of {c.output}", part) if k else part
     r = result["remainder"]
-    if not r:
+    if not r or result["verdict"] == "explained":
         return body
     facts = [f"It follows {listed(r['follows']) or 'none of the recorded signals'}."]
     if r["node"]:

@@ -121,12 +121,13 @@ def _found(found: Result, rows: Sequence[Output]) -> str:
         names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
         return f"Found: {listed(names)}."
     law = (found["remainder"] or {}).get("law")
-    follows = f": it follows {listed(law['of'])} at {law['where']}" if law and law["of"] else ""
-    small = not law and _small(rows)
-    what = "A small systematic error stays" if small else "Something is missing"
-    doubted = [name(a) for a in found["alternatives"] if a.get("why_not")][:2]
-    fits = f" {listed(doubted).capitalize()} would fit, but nothing else confirms it." if doubted else ""
-    return f"{what} that no effect of the catalogue explains{follows}.{fits}"
+    if law:
+        follows = f"; it follows {listed(law['of'])}" if law["of"] else ""
+        return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
+    what = "A small systematic error stays" if _small(rows) else "Something is missing"
+    doubted = listed([name(a) for a in found["alternatives"] if a.get("why_not")][:2])
+    fits = f" What would fit, and nothing else confirms: {doubted}." if doubted else ""
+    return f"{what} that no effect of the catalogue explains.{fits}"
 
 
 def _one_of(family: Result) -> str:
