@@ -74,12 +74,15 @@ def test_findings_are_told_by_size_with_units():
 
 def test_effects_that_imitate_each_other_are_told_together():
     two = [RADIATION | {"probability": 0.5}, LAG | {"probability": 0.46, "parameters": {}}]
-    family = {"effects": two, "probability": 0.97}
-    told = words(FOUND | {"verdict": "ambiguous", "findings": [], "alternatives": two, "families": [family]})
-    assert (
-        "One of these is there (probability 0.97), not told which: radiation at block or sensor lag at reading."
-        in told
+    found = FOUND | {"verdict": "ambiguous", "findings": [], "alternatives": two}
+    found["families"] = [{"effects": two, "probability": 0.97}]
+    assert words(found).startswith(
+        "One of these is there (probability 0.97), and these recordings do not tell which: "
+        "radiation at block (0.50), sensor lag at reading (0.46)."
     )
+    told = words(found | {"alternatives": [*two, LAG | {"effect": "creep", "probability": 0.3}]})
+    assert "Candidates, the likeliest first: radiation" in told
+    assert "One of these is there (probability 0.97): radiation at block or sensor lag at reading." in told
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def sentences(found: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
     rows = outputs(found)
     law = law_sentence((found["remainder"] or {}).get("law"))
-    told = [_found(found, rows), *map(_one_of, found.get("families", ())), law]
+    told = [_found(found, rows), *_families(found), law]
     if rows and (found["findings"] or law):
         told.append(_gain(found, max(rows, key=lambda o: o.gain)))
     return [text for text in (*told, _remainder(found, rows)) if text]
@@ -115,6 +115,14 @@ def _found(found: Result, rows: Sequence[Output]) -> str:
     if found["verdict"] == "ambiguous":
         every = sorted([*found["findings"], *found["alternatives"]], key=lambda a: -a["probability"])
         told = ", ".join(f"{name(a)} ({chance(a['probability'])}{_doubt(a)})" for a in every[:4])
+        whole = [
+            f for f in found.get("families", ()) if _members(f) >= {(a["effect"], a["where"]) for a in every}
+        ]
+        if whole:
+            sure = chance(whole[0]["probability"])
+            return (
+                f"One of these is there (probability {sure}), and these recordings do not tell which: {told}."
+            )
         text = "Something is missing, but these recordings do not name it for sure"
         return text + (f". Candidates, the likeliest first: {told}." if told else ".")
     if found["findings"]:
@@ -130,9 +138,18 @@ def _found(found: Result, rows: Sequence[Output]) -> str:
     return f"{what} that no effect of the catalogue explains.{fits}"
 
 
-def _one_of(family: Result) -> str:
-    names = " or ".join(name(e) for e in family["effects"])
-    return f"One of these is there (probability {chance(family['probability'])}), not told which: {names}."
+def _families(found: Result) -> list[str]:
+    """Return sentences on effects that imitate each other, beside others."""
+    known = {(a["effect"], a["where"]) for a in (*found["findings"], *found["alternatives"])}
+    return [
+        f"One of these is there (probability {chance(f['probability'])}): {' or '.join(map(name, f['effects']))}."
+        for f in found.get("families", ())
+        if found["verdict"] != "ambiguous" or not _members(f) >= known
+    ]
+
+
+def _members(family: Result) -> set[tuple[str, str]]:
+    return {(e["effect"], e["where"]) for e in family["effects"]}
 
 
 def _doubt(alternative: Result) -> str:
