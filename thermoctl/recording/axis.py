@@ -381,7 +381,7 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
         raise refused[0]
     if not good:
         raise LookupError("; ".join(f"'{'+'.join(c.columns)}' {c.why}" for c in ranked[:4]))
-    best = good[0]
+    best = next((c for c in good[1:] if not good[0].columns and _says_it(c, good[0])), good[0])
     others = _rivals(sheet, best, good[1:])
     names = list(sheet.columns)
     twins = {
@@ -401,6 +401,13 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
         mine = names[begins[k] : begins[k + 1]] + (names[: begins[0]] if k == 0 else [])
         found.append((c, [n for n in mine if n not in c.columns]))
     return found
+
+
+def _says_it(clock: Clock, stated: Clock) -> bool:
+    """Return whether a column of times holds what the file states of its interval."""
+    t, other = clock.seconds.t, stated.seconds.t
+    same = len(t) == len(other) and np.allclose(t - t[0], other - other[0], rtol=1e-6, atol=0.0)
+    return bool(same) and not clock.counter
 
 
 def _stem(name: str) -> str:
