@@ -121,7 +121,7 @@ def test_swapped_columns_are_refused_before_a_diagnosis(plant, frames):
 
 def test_a_refit_with_its_residuals_and_profile(frames, result):
     known = tc.refit(result.plant, frames)
-    g = {e.name: e for e in known.parameters}["G_12"]
+    g = known.parameters["G_12"]
     assert known.plant.parameters["G_12"] == pytest.approx(g.value)
     assert np.std(known.residuals("temperature_1")) == pytest.approx(0.1, rel=0.05)
     assert len(known.plot("temperature_2").axes) == 4 and "<svg" in known._repr_html_()

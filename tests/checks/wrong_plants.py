@@ -15,8 +15,10 @@ from tests.checks.rigs import PLANTS, rig
 from tests.checks.test_checks import DAMAGES, WRONG
 from thermoctl.checks import checks
 from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.evidence.held_out import split
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.result import contract
 from thermoctl.plant import Plant, loads
 from thermoctl.recording.table import Table
@@ -61,7 +63,7 @@ TEXT = """# Wrong plants and damaged recordings
 | outcome | meaning |
 |---|---|
 | refused | the plant file cannot be read, or too little was measured |
-| found | a severe finding of the checks, before any refit |
+| found | a severe finding of the checks, before any refit, or a wrong column that explains more than physics |
 | right | the mistake, or physics that is equal to it, is named with a probability above 0.9 |
 | unsure | nothing is named with a probability above 0.9 |
 | WRONG | physics that the rig lacks is named with a probability above 0.9 |
@@ -95,7 +97,10 @@ def judged(plant: Plant, table: Table, right: set[str]) -> tuple[str, str]:
     if severe:
         return "found", f"{severe[0].kind}: {severe[0].what}"[:90]
     try:
-        found = contract(diagnose(plant, [table], catalogue((CATALOGUE,)), limits()))
+        done = diagnose(plant, [table], catalogue((CATALOGUE,)), limits())
+        if wrong := relabelled(done, split([table], ())[0], limits()):
+            return "found", f"{wrong[0].kind}: {wrong[0].what}"[:90]
+        found = contract(done)
     except InputError as e:
         return "refused", str(e)[:90]
     named = {f["effect"]: f["probability"] for f in found["findings"]}

@@ -12,7 +12,7 @@ import numpy as np
 
 from tests.disk.harness import Writer, tell
 from thermoctl import cli, shipped
-from thermoctl.api import results
+from thermoctl.api import diagnosing
 from thermoctl.calibration import steps, wizard
 from thermoctl.configuration.settings import effective, load_settings
 from thermoctl.control.model import zero_model
@@ -201,7 +201,7 @@ def _write_diagnosis() -> None:
 def _api_save() -> None:
     found, content = FOUND[0][2], FOUND[0][3]
     of = SimpleNamespace(plant=SimpleNamespace(description=found.extended), json=content)
-    results.Diagnosis.save(of, "result")  # type: ignore[arg-type]
+    diagnosing.Diagnosis.save(of, "result")  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------------------------------------------------- all

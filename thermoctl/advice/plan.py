@@ -27,9 +27,9 @@ from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
 from thermoctl.plant.language import Plant
-from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.units import in_plant_units
 from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

@@ -6,26 +6,27 @@ of names to arrays, or a `Table`. Errors in the input are `thermoctl.yamlfile.In
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermoctl.api.data import Data, tables_of
 from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
-from thermoctl.api.results import Diagnosis, Simulation, joined
+from thermoctl.api.results import Simulation, joined
 from thermoctl.checks import Finding, checks
-from thermoctl.diagnosis.diagnose import diagnose as _diagnose
-from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import from_plain, load
 from thermoctl.plant.initial import last_state, with_start
 from thermoctl.plant.refit import fit
 from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
+
+if TYPE_CHECKING:
+    from thermoctl.api.diagnosing import Diagnosis, diagnose
 
 
 def load_plant(source: str | Path | Mapping[str, Any], map: str | Path | None = None) -> Plant:
@@ -114,25 +115,11 @@ def check(plant: Plant | str | Path, data: Data | Sequence[Data]) -> list[Findin
     return checks(own.description, tables_of(own.description, data))
 
 
-def diagnose(
-    plant: Plant | str | Path,
-    data: Data | Sequence[Data],
-    held_out: Data | Sequence[Data] = (),
-    effects: Sequence[str | Path] = (),
-    anyway: bool = False,
-) -> Diagnosis:
-    """Find the physics that a plant lacks. Raises InputError, also for a severe finding of `check`.
-
-    `held_out`: recordings for validation only; `effects`: folders of further effect files; `anyway`: diagnose
-    in spite of a severe finding."""
-    own = plant_of(plant)
-    tables = tables_of(own.description, data)
-    severe = [] if anyway else [f for f in checks(own.description, tables) if f.severe]
-    if severe:
-        raise InputError(f"{severe[0]} (anyway=True diagnoses in spite of it)")
-    entries = catalogue((CATALOGUE, *map(Path, effects)))
-    reserve = tables_of(own.description, held_out)
-    return Diagnosis(own, _diagnose(own.description, tables, entries, limits(), reserve))
+def __getattr__(name: str) -> Any:
+    """Return `diagnose` or `Diagnosis`, which load the whole diagnosis. Raises AttributeError for others."""
+    if name not in ("Diagnosis", "diagnose"):
+        raise AttributeError(f"module 'thermoctl.api' has no attribute '{name}'")
+    return getattr(importlib.import_module("thermoctl.api.diagnosing"), name)
 
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import in_parts
-from thermoctl.plant.recordings import in_plant_units
+from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.logger import read_recording
 from thermoctl.recording.table import Table
 from thermoctl.recording.units import split_unit

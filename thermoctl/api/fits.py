@@ -34,9 +34,12 @@ class Refit:
         return Plant(updated(self.before.description, self.fit, self.excitations))
 
     @property
-    def parameters(self) -> list[Estimate]:
-        """Value, standard error, state and trade-offs of each fitted parameter."""
-        return report(self.fit, self.excitations)
+    def parameters(self) -> dict[str, Estimate]:
+        """Value, standard error, state and trade-offs of each fitted parameter, by name.
+
+        One of a recording of its own is called `NAME (RECORDING)`."""
+        found = report(self.fit, self.excitations)
+        return {f"{e.name} ({e.recording})" if e.recording else e.name: e for e in found}
 
     @property
     def rms(self) -> dict[str, float]:
@@ -61,10 +64,10 @@ class Refit:
 
         The other parameters are fitted anew at each. A rise of 3.84 bounds the 95 % interval. `reach`: half
         the width in standard errors. Raises InputError for a parameter that was not fitted."""
-        found = next((e for e in self.parameters if e.name == parameter), None)
+        found = self.parameters.get(parameter)
         limits = self.before.description.parameters[parameter].range if found else None
         if found is None or limits is None:
-            names = [e.name for e in self.parameters]
+            names = list(self.parameters)
             raise InputError(
                 f"'{parameter}' was not fitted{suggest(parameter, names)}; {', '.join(names)} were"
             )
@@ -104,9 +107,11 @@ class Refit:
         return self.fit.model.outputs.index(output)
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{e.name} = {e.value:.5g} ± {e.sd:.2g}" for e in self.parameters)
+        shown = ", ".join(f"{n} = {e.value:.5g} ± {e.sd:.2g}" for n, e in self.parameters.items())
         return f"<Refit: {shown}>"
 
     def _repr_html_(self) -> str:
-        rows = [(e.name, f"{e.value:.6g}", f"{e.sd:.2g}", e.unit or "", e.state) for e in self.parameters]
+        rows = [
+            (n, f"{e.value:.6g}", f"{e.sd:.2g}", e.unit or "", e.state) for n, e in self.parameters.items()
+        ]
         return table(("parameter", "value", "standard error", "unit", "state"), rows) + figure(self.plot())

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtri
 
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
@@ -63,6 +62,8 @@ def residual_panels(e: np.ndarray, name: str, unit: str | None) -> Figure:
     titled(axes[0, 0], f"residuals of {name}", "sample", unit or "")
     draw_autocorrelation(axes[0, 1], e)
     draw_periodogram(axes[1, 0], e)
+    from scipy.special import ndtri
+
     expected = ndtri((np.arange(len(e)) + 0.5) / len(e))
     axes[1, 1].plot(expected, np.sort(e), ".", ms=2, color="#2b6cb0")
     axes[1, 1].plot(expected, e.mean() + e.std() * expected, color="#c2410c", lw=0.8, ls="--")

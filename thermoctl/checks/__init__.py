@@ -13,8 +13,8 @@ from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import label_findings
 from thermoctl.checks.model import plant_findings, start_findings
 from thermoctl.plant import Plant
-from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
 
 __all__ = ["Finding", "checks"]

@@ -153,6 +153,7 @@ def _run(
             parsed_limits(args.limit or ()),
             stopped,
             Path(args.continued) if args.continued else None,
+            anyway=args.anyway,
         )
 
 

@@ -14,11 +14,13 @@ from typing import Any
 from thermoctl.diagnosis import diagnose as engine
 from thermoctl.diagnosis.data import memory
 from thermoctl.diagnosis.evidence.fit import remembered
+from thermoctl.diagnosis.evidence.held_out import split
 from thermoctl.diagnosis.experiment import file as experiment_file
 from thermoctl.diagnosis.experiment.design import NONE, Ranges
 from thermoctl.diagnosis.experiment.propose import propose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits as numbers
+from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.report.page import write_report
 from thermoctl.diagnosis.report.trend import earlier_trends, told, trends
 from thermoctl.diagnosis.report.unseen import not_seen
@@ -54,6 +56,7 @@ def diagnose(
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
     report: bool = True,
+    anyway: bool = False,
 ) -> dict[str, Any]:
     """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
 
@@ -64,6 +67,7 @@ def diagnose(
     - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
     - `report`: write report.html, too
+    - `anyway`: also where wrong columns explain the recordings better than physics
 
     Raises InputError for unusable inputs."""
     if not tables:
@@ -82,6 +86,8 @@ def diagnose(
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
+    if not (anyway or stopped()) and (wrong := relabelled(found, split(chosen_on, reserve)[0], numbers())):
+        raise InputError(f"{wrong[0]} (--anyway diagnoses in spite of it)")
     proposed = None if stopped() else propose(found, drivable, limits, progress)
     result = contract(found)
     result["next_experiment"] = proposed[0] if proposed else None

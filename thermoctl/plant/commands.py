@@ -18,9 +18,10 @@ from thermoctl.plant.ahead import ahead, all_uncertain
 from thermoctl.plant.estimate import Estimate, report, updated
 from thermoctl.plant.initial import last_state, with_start
 from thermoctl.plant.noise import coloured
-from thermoctl.plant.recordings import as_recorded, read_recordings
+from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.refit import Fit, fit
 from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.units import as_recorded
 from thermoctl.recording.files import write_table
 from thermoctl.recording.logger import options, print_notes
 from thermoctl.recording.table import Table

@@ -15,8 +15,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
-from thermoctl.plant.recordings import in_plant_units
 from thermoctl.plant.sensor import error
+from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
 

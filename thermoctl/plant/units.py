@@ -1,5 +1,7 @@
 """Check the units of a plant by dimension: m equals um, degC counts as K, % and 1 are dimensionless.
 
+Bring recordings to a plant's units, and back.
+
 A flow's unit must follow from its node (storage times node per second), an expression's from its names. A
 bare number and a name without a unit fit anywhere, and so does a product with one of them. Exponents are pure
 numbers.
@@ -7,12 +9,17 @@ numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from fractions import Fraction
+
+import numpy as np
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import Input, Node, Parameter, Plant
+from thermoctl.plant.language import Input, Node, Output, Parameter, Plant
+from thermoctl.recording.table import Table
+from thermoctl.recording.units import split_unit
 from thermoctl.units import Dimension, conversion, described, dimension, raised, times
 from thermoctl.yamlfile import InputError
 
@@ -183,3 +190,63 @@ def _declared(plant: Plant, what: str, unit: str | None, at: str) -> Dimension |
         return dimension(unit)
     except ValueError as error:
         raise InputError(f"{plant.file}:{at}: unit of {what}: {error}") from None
+
+
+def in_plant_units(plant: Plant, table: Table) -> Table:
+    """Return a table with the columns that the plant reads in its units; each conversion is a note.
+
+    The plant file's `column` decides (scale and offset, or a unit), else the unit in the file's header. A
+    table that is in the plant's units already is returned as it is. Raises InputError for a wrong unit."""
+    if not table.recorded:
+        return table
+    columns, units, notes = dict(table.columns), dict(table.units), list(table.notes)
+    done: dict[str, tuple[float, float]] = {}
+    for item in plant.readings():
+        plain = split_unit(item.column)[0]
+        if item.column not in columns and plain in columns:  # the plant names the header with its unit
+            columns[item.column], units[item.column] = columns.pop(plain), units.pop(plain, "")
+        if item.column not in columns:
+            continue
+        scale, offset = change = _conversion(plant, table, item, units.get(item.column))
+        if done.setdefault(item.column, change) != change:
+            raise InputError(
+                f"{plant.file}:{item.at}: column '{item.column}' is read in two units; one unit was expected"
+            )
+        if change == (1.0, 0.0):
+            continue
+        columns[item.column] = scale * table.columns.get(item.column, columns[item.column]) + offset
+        shown = f"{scale:g} * {item.column}" + (f" {offset:+g}" if offset else "")
+        given = (item.conversion.unit if item.conversion else None) or units.get(item.column)
+        by = f" ({given} to {item.unit})" if given else ""
+        notes.append(f"'{item.name}' = {shown}{by}")
+    return replace(table, columns=columns, notes=tuple(notes), recorded=False)
+
+
+def as_recorded(plant: Plant, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return columns in the plant's units as a file holds them that the plant shall read again."""
+    found = dict(columns)
+    for item in plant.readings():
+        if item.conversion and item.column in found:
+            scale, offset = _stated(item)
+            found[item.column] = (columns[item.column] - offset) / scale
+    return found
+
+
+def _stated(item: Input | Output) -> tuple[float, float]:
+    c = item.conversion
+    assert c is not None
+    return conversion(c.unit, item.unit) if c.unit and item.unit else (c.scale, c.offset)
+
+
+def _conversion(plant: Plant, table: Table, item: Input | Output, header: str | None) -> tuple[float, float]:
+    if item.conversion:
+        return _stated(item)
+    if not header or not item.unit or header == item.unit:
+        return 1.0, 0.0
+    try:
+        return conversion(header, item.unit)
+    except ValueError as e:
+        raise InputError(
+            f"{table.path}: column '{item.column}' (for '{item.name}' of {plant.file}): {e}; correct the header, "
+            f"or state the column's unit in the plant file: column: {{name: {item.column}, unit: ...}}"
+        ) from None

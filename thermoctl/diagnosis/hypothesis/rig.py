@@ -6,13 +6,16 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
-from thermoctl.plant.simulate import Excitation
 from thermoctl.units import dimension
+
+if TYPE_CHECKING:
+    from thermoctl.plant.simulate import Excitation
 
 SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
 STRAIGHT = "_straight"  # of the name of an input that holds, where it goes on straight lines

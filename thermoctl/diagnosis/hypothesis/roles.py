@@ -7,13 +7,16 @@ ambient is the temperature that losses of heat are counted from. Each assumption
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermoctl.diagnosis.hypothesis.rig import MEANINGS, SOUNDS, TEMPERATURE, Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input, Node, Output, Plant
-from thermoctl.plant.simulate import Excitation
+
+if TYPE_CHECKING:
+    from thermoctl.plant.simulate import Excitation
 
 RATES = ("", "velocity", "rotation", "voltage")  # kinds that a velocity by structure may have
 PLACES = ("", "length", "voltage")  # kinds that its position may have

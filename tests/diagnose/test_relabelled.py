@@ -1,0 +1,61 @@
+"""Swapped columns compete with physics after a search, also where physics is missing; a gain has to be a sensor's."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import pytest
+
+from tests.checks.rigs import inputs, truth
+from tests.plants import TWO_BLOCKS
+from thermoctl.checks import checks
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.relabelled import absurd, relabelled
+from thermoctl.plant import loads
+from thermoctl.plant.simulate import compile_plant
+
+CLOSE = TWO_BLOCKS.replace("0.02, unit: W/K, range: [0.004, 0.08]", "0.2, unit: W/K, range: [0.04, 1]")
+RADIATES = CLOSE.replace(
+    "outputs:",
+    '  radiated: {from: one, rate: "4e-10 * ((one + 273.15)**4 - (air + 273.15)**4)", unit: W}\noutputs:',
+)
+ONE, TWO = "temperature_1", "temperature_2"
+
+
+@pytest.fixture(scope="module")
+def searched():
+    """A plant that lacks radiation, a recording, the same with two columns swapped, and the diagnoses of both."""
+    plant, entries = loads(CLOSE, "plant.yaml"), catalogue((CATALOGUE,))
+    table = compile_plant(truth(loads(RADIATES), 3)).measure(inputs("two blocks"), 3)
+    columns = table.columns | {ONE: table.columns[TWO], TWO: table.columns[ONE]}
+    swapped = dataclasses.replace(table, columns=columns)
+    return plant, [(t, diagnose(plant, [t], entries, limits())) for t in (table, swapped)]
+
+
+def test_swapped_columns_are_told_from_physics(searched):
+    plant, ((table, right), (swapped, wrong)) = searched
+    assert not [f for f in checks(plant, [table]) if f.severe]
+    assert right.decision.verdict != "consistent" and relabelled(right, [table], limits()) == []
+    assert wrong.decision.verdict == "explained", "physics that imitates the mistake"
+    (finding,) = relabelled(wrong, [swapped], limits())
+    assert (
+        finding.severe and f"'{ONE}' and '{TWO}' are swapped" in finding.what and "convection" in finding.what
+    )
+    assert finding.suggestion == f"If so: --columns {ONE}={TWO},{TWO}={ONE}"
+
+
+@pytest.mark.parametrize(("gain", "refused"), [(1.79, True), (0.25, True), (1.1, False), (0.7, False)])
+def test_a_gain_that_no_sensor_has_is_a_wrong_column(gain, refused):
+    named = SimpleNamespace(key=("sensor_gain", "heat"), own={"A": "A_of_heat"})
+    refitted = SimpleNamespace(parameters={"A_of_heat": SimpleNamespace(value=gain)})
+    found = SimpleNamespace(
+        shown=(named,),
+        best=SimpleNamespace(plant=refitted),
+        case=SimpleNamespace(plant=loads(CLOSE, "plant.yaml")),
+    )
+    told = absurd(found, "run.csv")
+    assert bool(told) is refused
+    assert all(
+        f.severe and f"{gain:.3g} at 'heat'" in f.what and "another unit" in f.suggestion for f in told
+    )

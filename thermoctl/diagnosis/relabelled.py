@@ -1,0 +1,105 @@
+"""Wrong columns as rivals of physics, once that was found: swapped ones, and gains that no sensor has.
+
+The checks before a diagnosis find swapped columns where nothing else is missing. Here each pair is swapped
+in the recordings, which holds the same numbers under other names. So their log evidence is compared:
+
+    swapped where  score(best with the pair swapped) - score(best as recorded) > log(RARITY pairs)
+
+Only a pair that improves the plant without effects by as much is searched for effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import exp, log
+
+import numpy as np
+
+from thermoctl.checks.finding import Finding
+from thermoctl.checks.labels import RARITY, Hypothesis, swaps
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.result import Diagnosis
+from thermoctl.diagnosis.search.beam import search
+from thermoctl.plant.simulate import SimulationError
+from thermoctl.recording.table import Table
+from thermoctl.yamlfile import InputError
+
+GAINS = (0.3, 1.5)  # of a sensor: a stem in still air reads a third at worst; 1.8 is degF for degC
+GAIN, SIZE = "sensor_gain", "A"
+
+
+def relabelled(found: Diagnosis, tables: Sequence[Table], limits: Thresholds) -> list[Finding]:
+    """Return severe findings where a wrong column explains the recordings better than what was found.
+
+    `tables`: the recordings that took part in the choice, as they were given. A diagnosis that goes on from
+    an earlier one is not asked: the earlier recordings are gone."""
+    if found.decision.verdict == "consistent" or found.case.memory.recordings:
+        return []
+    where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
+    swapped = _swapped(found, tables, limits, where)
+    return [swapped] if swapped else absurd(found, where)
+
+
+def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, where: str) -> Finding | None:
+    known, now = found.case, {w.fitted.hypothesis.keys: w.score for w in found.searched.tried}
+    pairs = list(swaps(known.plant, tables))
+    proof = log(RARITY * max(len(pairs), 1))
+    best: tuple[float, Hypothesis, Sequence[Table]] | None = None
+    for h in pairs:
+        other = [h.change(t) for t in tables]
+        try:
+            again = case(
+                known.plant, other, known.catalogue, Budget(limits.fits, stopped=known.budget.stopped)
+            )
+            score = fitted(again, again.plant, (), again.null).log_evidence
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue
+        if score > now[frozenset()] + proof and (best is None or score > best[0]):
+            best = score, h, other
+    if best is None or known.budget.stopped():
+        return None
+    _, h, other = best
+    budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
+    leader = search(case(known.plant, other, known.catalogue, budget), limits).tried[0]
+    if leader.score <= max(now.values()) + proof:
+        return None
+    effects = ", ".join(f"{e} at {w}" for e, w in sorted(leader.fitted.hypothesis.keys))
+    a, b = h.columns
+    return Finding(
+        "swapped",
+        where,
+        f"the columns '{a}' and '{b}' are swapped: so read, the recordings fit the plant {_with(effects)}better than with "
+        f"{_listed(found.best.hypothesis.effects)} as they are ({exp(min(leader.score - max(now.values()), 200.0)):.0e} times as likely)",
+        h.suggestion,
+    )
+
+
+def _with(effects: str) -> str:
+    return f"with {effects} " if effects else ""
+
+
+def _listed(effects: Sequence[Placed]) -> str:
+    return ", ".join(f"{e.key[0]} at {e.key[1]}" for e in effects) or "no effect"
+
+
+def absurd(found: Diagnosis, where: str) -> list[Finding]:
+    """Return a finding for each gain that would be named and that no sensor has."""
+    findings = []
+    for e in found.shown:
+        if e.key[0] != GAIN or SIZE not in e.own:
+            continue
+        gain = found.best.plant.parameters[e.own[SIZE]].value
+        if not GAINS[0] <= gain <= GAINS[1]:
+            item = next(r for r in found.case.plant.readings() if r.name == e.key[1])
+            findings.append(
+                Finding(
+                    "gain",
+                    where,
+                    f"the recordings ask for a gain of {gain:.3g} at '{item.name}', which no sensor has",
+                    f"Is the column '{item.column}' in another unit, or another quantity? State it in the plant file: "
+                    f"column: {{name: {item.column}, unit: ...}}. Or is a fixed number that it is multiplied by wrong?",
+                )
+            )
+    return findings
