@@ -176,8 +176,8 @@ $(VENV)/.documented: pyproject.toml
 	@touch $@
 
 .PHONY: stranger
-stranger: develop                  # another simulator's log with ; and decimal commas, up to the right name: commands, edits, times
-	$(BIN)/python -m pytest -q -s -k strangers_rig tests/plant/test_plant_new.py
+stranger: develop                  # a motor, a building, a printer, an axis: files of their tools up to the right name: commands, edits, times
+	$(BIN)/python -m tests.plant.strangers
 
 .PHONY: notebooks
 notebooks: develop                 # every notebook of docs/notebooks from the first cell to the last

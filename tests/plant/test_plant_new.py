@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thermoctl import cli
-from thermoctl.plant import load
+from thermoctl.plant import load, loads
 from thermoctl.plant.new import TEMPLATES
 from thermoctl.plant.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -52,7 +52,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_a_strangers_rig_in_ten_minutes(folder, capsys):
-    """`make stranger` prints the commands, the two edits and their times."""
+    """Two edits up to the right name; `make stranger` does so with files of four tools."""
     stranger(folder / "log.csv")
     times = []
 
@@ -297,3 +297,31 @@ def test_levels_and_a_pump_become_tanks(folder):
     assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
     values = {n.split("_")[0]: p.value for n, p in load("p.yaml").parameters.items()}
     assert values == {"area": pytest.approx(area, rel=0.05), "outlet": pytest.approx(outlet, rel=0.05)}
+
+
+def test_names_say_what_heats_what(folder):
+    t = np.arange(0.0, 900.0, 3.0)
+    on = (t // 150).astype(int) % 2
+    rows = "\n".join(
+        f"{a:g},{b},{1 - b},{22 + 0.1 * a * b / (1 + a):.3f},{21 + 20 * (1 - np.exp(-a / 200)):.3f},{900 * b}"
+        for a, b in zip(t, on, strict=True)
+    )
+    head = "t,extruder_pwm,heater_bed_pwm,extruder_temp,heater_bed_temp,sensor.heat_pump_power"
+    (folder / "a.csv").write_text(f"{head}\n{rows}\n")
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    text = (folder / "p.yaml").read_text()
+    assert text.count('value: "?", unit: W') == 2  # full power of each share of 0 to 1
+    plant = loads(text.replace('"?"', "50"), "p.yaml")
+    into = {f.name: f.target for f in plant.flows.values() if f.source is None}
+    assert into["heat_extruder_pwm"] == "extruder" and into["heat_heater_bed_pwm"] == "heater_bed"
+    assert "heat_pump_power" in plant.inputs and "W_heat_pump_power" in plant.parameters, "no flow of a pump"
+    (folder / "p.yaml").unlink()
+    assert cli.main(["plant", "new", "p.yaml", "--template", "hot-end", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    duty = plant.inputs["duty"]
+    assert (duty.column, duty.conversion.unit, plant.outputs["T_block"].column) == (
+        "extruder_pwm",
+        "1",
+        "extruder_temp",
+    )
+    assert plant.parameters["fan"].value == 0, "no fan was recorded"

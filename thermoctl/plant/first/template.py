@@ -151,7 +151,10 @@ def _score(item: Input | Output, c: Column | None) -> float:
     same = any(own & p and any(w in p or any(len(q) > 4 and q in w for q in p) for w in its) for p in places)
     other = any(not own & p and any(w in p for w in its) for p in places)
     return (
-        1.0 + (2.0 if same else 0.0) + (1.0 if own & set(its) else 0.0) - (0.5 if other and not same else 0.0)
+        (1.7 if c.kind == "duty" else 1.0)
+        + (2.0 if same else 0.0)
+        + (1.0 if own & set(its) else 0.0)
+        - (0.5 if other and not same else 0.0)
     )
 
 
