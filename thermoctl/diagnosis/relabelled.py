@@ -5,6 +5,7 @@ in the recordings, which holds the same numbers under other names. So their log 
 
     swapped where  score(best with the pair swapped) - score(best as recorded) > log(RARITY pairs)
 
+An input and an output are no pair: a run that is given a reading predicts it without physics.
 Only a pair that improves the plant without effects by as much is searched for effects.
 """
 
@@ -44,7 +45,8 @@ def relabelled(found: Diagnosis, tables: Sequence[Table], limits: Thresholds) ->
 
 def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, where: str) -> Finding | None:
     known, now = found.case, {w.fitted.hypothesis.keys: w.score for w in found.searched.tried}
-    pairs = list(swaps(known.plant, tables))
+    inputs = {i.column for i in known.plant.inputs.values()}
+    pairs = [h for h in swaps(known.plant, tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Sequence[Table]] | None = None
     for h in pairs:
