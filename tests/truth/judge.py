@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from tests.proof.score import CONFIDENT, score
 from tests.proof.statistics import Share, share
 from tests.truth.cases import STRAY, TOLERATED, Case
 
 SURE = 0.99
+BANDS = ("large", "middle", "small")
 EDGE = 1e-3  # probabilities are taken between this and 1 less this, so that one wrong certainty does not decide the score
 Name = tuple[str, str, float, str]  # effect, place, probability, what it is worth
 
 
 class Row(TypedDict):
     """One judged case, as it is kept. `found`: how many of `wanted` were named with CONFIDENT or more.
+
+    `band`: how large the concealed effect is, where the answer says so.
 
     `covered`: of the true parameters of right names, how many lie inside their 95 % interval, of how many."""
 
@@ -28,6 +31,7 @@ class Row(TypedDict):
     covered: tuple[int, int]
     cpu_s: float
     error: str | None
+    band: NotRequired[str | None]
 
 
 def row(case: Case, result: Mapping[str, Any] | None, cpu_s: float, error: str | None) -> Row:
@@ -50,6 +54,7 @@ def row(case: Case, result: Mapping[str, Any] | None, cpu_s: float, error: str |
         "covered": (sum(p["covered"] for p in parameters), len(parameters)),
         "cpu_s": cpu_s,
         "error": error,
+        "band": case.answer.get("band"),
     }
 
 
@@ -66,6 +71,7 @@ def figures(rows: Sequence[Row]) -> Figures:
     return {
         "cases": str(len(rows)),
         "right names": _text(Share(found, wanted)),
+        "large, middle, small": ", ".join(_of_band(rows, band) for band in BANDS),
         "strays at 0.9": str(sum(p >= CONFIDENT and w == STRAY for _, _, p, w in names)),
         "strays": str(sum(w == STRAY for *_, w in names)),
         "traps refused": _text(share(all(p < CONFIDENT for _, _, p, _ in r["names"]) for r in traps)),
@@ -78,6 +84,11 @@ def figures(rows: Sequence[Row]) -> Figures:
         "median": f"{costs[len(costs) // 2]:.1f}" if costs else "-",
         "longest": f"{costs[-1]:.1f}" if costs else "-",
     }
+
+
+def _of_band(rows: Sequence[Row], band: str) -> str:
+    own = [r for r in rows if r.get("band") == band]
+    return f"{sum(r['found'] for r in own)}/{sum(r['wanted'] for r in own)}" if own else "-"
 
 
 def _score(p: float, worth: str) -> float:
