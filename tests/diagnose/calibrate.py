@@ -8,8 +8,8 @@ other numbers, without a refit. OUT is the folder of `python -m tests.proof --re
 
 Of all combinations of values the best has the most right names less false ones, as a share of the effects that are
 there: in the cases, and as much again on the real rigs. Of equal ones it has the least loss. The loss of a case is the
-mean log loss of its effects' probabilities: those that are there, and those that are not. (Its least value alone lies
-at a temperature of 5, which names a third less.) `--write` puts values and provenance into config/diagnosis.yaml.
+mean log loss of its effects' probabilities: those that are there, and those that are not. `--write` puts values and
+provenance into config/diagnosis.yaml.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from thermoctl.plant import load
 NUMBERS = {
     "missing": (0.02, 0.05, 0.1, 0.2, 0.35, 0.5),
     "rare": (0.01, 0.03, 0.1, 0.3),
-    "temperature": (0.7, 1.0, 1.25, 1.5, 2.0, 3.0),
     "alike": (0.05, 0.075, 0.1, 0.15),
 }
 CONTAINS = contained(catalogue((CATALOGUE,)))
@@ -136,7 +135,7 @@ def posterior(case: Judged, numbers: Thresholds) -> Probabilities:
         + case.rare[keys] * np.log(numbers.rare)
         for keys in physics
     }
-    return weigh(scores, physics, numbers)
+    return weigh(scores, physics)
 
 
 def names(cases: Sequence[Judged], numbers: Thresholds) -> tuple[int, int]:

@@ -15,7 +15,7 @@ NOTHING, ONE, OTHER, BOTH = frozenset(), frozenset({A}), frozenset({B}), frozens
 
 
 def weighed(scores):
-    return weigh(scores, {keys: dict.fromkeys(keys, 1.0) for keys in scores}, limits())
+    return weigh(scores, {keys: dict.fromkeys(keys, 1.0) for keys in scores})
 
 
 def test_a_small_remainder_that_is_certain_is_not_nothing():
@@ -69,7 +69,7 @@ def test_an_effect_gathers_the_probability_of_all_hypotheses_that_hold_it():
 
 
 def test_a_likely_effect_that_may_be_a_misfit_is_no_certainty():
-    found = weigh({NOTHING: 0.0, ONE: 40.0}, {NOTHING: {}, ONE: {A: 0.7}}, limits())
+    found = weigh({NOTHING: 0.0, ONE: 40.0}, {NOTHING: {}, ONE: {A: 0.7}})
     assert found.effects[A] == pytest.approx(0.7)
     assert found.something == pytest.approx(0.7)
 

@@ -3,7 +3,6 @@
 import pytest
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.verdict.decide import weigh
 from thermoctl.diagnosis.verdict.families import families
 
@@ -15,7 +14,7 @@ DRAG, LAG = ("quadratic_drag", "v"), ("sensor_lag", "v")
 def of(scores, named=(), physics=1.0, asked=None):
     scores = {frozenset(k): s for k, s in scores}
     sure = {keys: dict.fromkeys(keys, physics) for keys in scores}
-    return families(weigh(scores, sure, limits()), sure, named, ENTRIES, asked or {}, 0.9)
+    return families(weigh(scores, sure), sure, named, ENTRIES, asked or {}, 0.9)
 
 
 def test_two_frictions_are_one_sure_friction():

@@ -86,7 +86,6 @@ def _fine(case: Any) -> list[bool]:
 
 
 RULES: Mapping[str, Rule] = {
-    "temperature": Rule("differences in log evidence are divided by 1.5", limits={"temperature": 1.0}),
     "misfit": Rule(
         "an effect counts only where it stands out of the misfit that stays",
         {"verdict.misfit.physics": _sure},

@@ -100,7 +100,7 @@ def _decided(sought: Sought) -> Diagnosis:
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     fits = {keys: w.fitted for keys, w in tried.items()}
-    posterior = weigh({keys: tried[keys].score for keys in physics}, physics, numbers)
+    posterior = weigh({keys: tried[keys].score for keys in physics}, physics)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     asked: dict[Key, float] = {}
     if posterior.something >= numbers.name:

@@ -20,7 +20,6 @@ class Thresholds:
     rare: float
     name: float
     set: float
-    temperature: float
     clean: float
     alike: float
 

@@ -84,7 +84,7 @@ def _laws(
 
 def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
     """Return the likeliest of the laws at one place; with others that fit about as well."""
-    share = softmax(np.array([w.score for _, w in found]) / limits.temperature)
+    share = softmax(np.array([w.score for _, w in found]))
     order = np.argsort(-share, kind="stable")
     best = found[order[0]][1]
     kinds = {found[order[0]][0].kind}

@@ -58,17 +58,14 @@ class Decision:
 
 
 def weigh(
-    scores: Mapping[frozenset[Key], float],
-    physics: Mapping[frozenset[Key], Mapping[Key, float]],
-    limits: Thresholds,
+    scores: Mapping[frozenset[Key], float], physics: Mapping[frozenset[Key], Mapping[Key, float]]
 ) -> Probabilities:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
-    `scores`: log evidence plus log prior odds. They are divided by `limits.temperature` (diagnosis.yaml):
-    a value above 1 makes the probabilities less extreme. `physics`: probability that each effect of a
-    hypothesis is physics and no unnamed misfit."""
-    total = logsumexp(np.array([*scores.values()]) / limits.temperature)
-    of = {keys: float(np.exp(score / limits.temperature - total)) for keys, score in scores.items()}
+    `scores`: log evidence plus log prior odds. `physics`: probability that each effect of a hypothesis is
+    physics and no unnamed misfit."""
+    total = logsumexp(np.array([*scores.values()]))
+    of = {keys: float(np.exp(score - total)) for keys, score in scores.items()}
     order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
     hypotheses = {keys: of[keys] for keys in order}
     effects: dict[Key, float] = {}

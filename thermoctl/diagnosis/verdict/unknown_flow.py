@@ -65,7 +65,7 @@ def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Thresholds
     if not gains:
         return Missing()
     odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
-    p = float(expit((logsumexp(list(gains.values())) + odds) / limits.temperature))
+    p = float(expit(logsumexp(list(gains.values())) + odds))
     best = max(gains, key=lambda where: gains[where])
     along = f.plant.flows.get(best)
     where = f"along {best}" if along else f"into {best}"
