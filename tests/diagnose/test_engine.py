@@ -138,9 +138,9 @@ def test_the_same_input_gives_the_same_bytes(lagged):
     assert written(folder / "out") == first
 
 
-def test_explain_retraces_the_verdict_in_ten_lines(lagged, capsys):
+def test_explain_retraces_the_verdict_in_a_screen(lagged, capsys):
     assert main(["diagnose", "--explain", str(lagged[1] / "out")]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 10
+    assert len(lines) <= 24
     assert lines[0].startswith("verdict: explained, because")
     assert any("sensor_lag at reading" in line for line in lines)

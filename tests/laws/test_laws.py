@@ -127,7 +127,7 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     other = replace(law.proposal, terms=(bent,), sizes=(3.5 * law.proposal.sizes[0],))
     rival = refitted_law(known, parent, other, parent)
     both = replace(law, placed=replace(law.placed, rivals=((other, rival, 0.4),)))
-    undecided = SimpleNamespace(case=known, decision=SimpleNamespace(verdict="unexplained"), law=both)
+    undecided = SimpleNamespace(case=known, decision=SimpleNamespace(verdict="partly_explained"), law=both)
     assert [share for _, share, _ in survivors(undecided)] == pytest.approx([0.6, 0.4])
     entry, _ = propose(undecided)
     assert "current" in entry["inputs"]

@@ -168,22 +168,23 @@ def survivors(found: Diagnosis) -> list[Standing]:
     Where no effect is named although one is likelier than none, the plant as it is counts, too. Where nothing
     else confirms an effect, it counts by the chance that this leaves. Each has its probability and its name.
     The list is empty where nothing is undecided."""
-    verdict, hypotheses = found.decision.verdict, dict(found.posterior.hypotheses)
-    if verdict == "ambiguous" or (verdict == "consistent" and found.posterior.something > 0.5):
-        hypotheses = {k: p for k, p in hypotheses.items() if k or verdict == "consistent"}
-    elif verdict == "unexplained":
-        doubt = 1.0 - min(found.asked.values(), default=1.0)
-        hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
-    elif not found.law:
-        return []
-    if found.law:
+    verdict = found.decision.verdict
+    if verdict in ("ambiguous", "unexplained") or (
+        verdict == "consistent" and found.posterior.something > 0.5
+    ):
+        hypotheses = {k: p for k, p in found.posterior.hypotheses.items() if k or verdict != "ambiguous"}
+        if verdict == "unexplained":
+            doubt = 1.0 - min(found.asked.values(), default=1.0)
+            hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
+        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+        likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
+    elif found.law:
         likely = [
             (f, share, described(p, f))
             for p, f, share in ((found.law.proposal, found.law.fitted, found.law.share), *found.law.rivals)
         ]
     else:
-        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
-        likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
+        return []
     likely.sort(key=lambda x: -x[1])
     return [x for x in likely if x[1] >= LIKELY * likely[0][1] and x[1] > 0][:MOST]
 
