@@ -143,4 +143,4 @@ def test_explain_retraces_the_verdict_in_a_screen(lagged, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 24
     assert lines[0].startswith("verdict: explained, because")
-    assert any("sensor_lag at reading" in line for line in lines)
+    assert any("sensor lag at reading" in line for line in lines)
