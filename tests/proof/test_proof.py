@@ -254,7 +254,7 @@ def test_the_size_found_half_of_the_time_is_that_of_scipy_and_its_interval_holds
 
 def test_a_kept_result_is_of_the_integrator_too_and_not_of_what_scores_it():
     names = {f.name for f in program_files()}
-    assert {"integrator.h", "refit.py", "search.py", "radiation.yaml"} <= names
+    assert {"integrator.h", "refit.py", "beam.py", "radiation.yaml"} <= names
     assert "score.py" not in names
 
 

@@ -4,8 +4,10 @@ The checks before a diagnosis find swapped columns where nothing else is missing
 in the recordings, which holds the same numbers under other names. So their log evidence is compared:
 
     swapped where  score(best with the pair swapped) - score(best as recorded) > log(RARITY pairs)
+              and  misfit(best with the pair swapped) < HALF misfit(best as recorded), if that leaves one
 
-An input and an output are no pair: a run that is given a reading predicts it without physics.
+A real plant is wrong in small ways, and its evidence counts each by hundreds of nats: so a misfit has to
+fall, too. An input and an output are no pair: a run that is given a reading predicts it without physics.
 Only a pair that improves the plant without effects by as much is searched for effects.
 """
 
@@ -18,8 +20,9 @@ import numpy as np
 
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
-from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
+from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
@@ -28,6 +31,7 @@ from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
 GAINS = (0.3, 1.5)  # of a sensor: a stem in still air reads a third at worst; 1.8 is degF for degC
+HALF = 0.5  # of the misfit: a swap that is true takes nearly all of what it caused
 GAIN, SIZE = "sensor_gain", "A"
 
 
@@ -50,7 +54,7 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Sequence[Table]] | None = None
     for h in pairs:
-        other = [h.change(t) for t in tables]
+        other: Sequence[Table] = [h.change(t) for t in tables]
         try:
             again = case(
                 known.plant, other, known.catalogue, Budget(limits.fits, stopped=known.budget.stopped)
@@ -64,8 +68,12 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
         return None
     _, h, other = best
     budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
-    leader = search(case(known.plant, other, known.catalogue, budget), limits).tried[0]
+    again = case(known.plant, other, known.catalogue, budget)
+    leader, present = search(again, limits).tried[0], found.searched.tried[0]
     if leader.score <= max(now.values()) + proof:
+        return None
+    stays = _misfit(known, present.fitted, limits)
+    if stays and _misfit(again, leader.fitted, limits) >= HALF * stays:
         return None
     effects = ", ".join(f"{e} at {w}" for e, w in sorted(leader.fitted.hypothesis.keys))
     a, b = h.columns
@@ -76,6 +84,11 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
         f"{_listed(found.best.hypothesis.effects)} as they are ({exp(min(leader.score - max(now.values()), 200.0)):.0e} times as likely)",
         h.suggestion,
     )
+
+
+def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:
+    """Return the sum over outputs of the mean square over the noise, as far as it is above the noise."""
+    return sum(max(x**2 - limits.clean**2, 0.0) for x in over_noise(case, f))
 
 
 def _with(effects: str) -> str:
