@@ -94,7 +94,8 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     assert ahead.min() > 15 and ahead.max() < 110
     assert entry["separates"][0]["sigmas"] > 3 and entry["bits"] > 0.6
     assert entry["bits_per_hour"] == pytest.approx(entry["bits"] / (entry["duration_s"] / 3600))
-    assert propose(found) is None  # no limits given: not beyond what was recorded, and there they look alike
+    near, _ = propose(found)  # no limits given: not beyond what was recorded, and there they look alike
+    assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
 
 
 HOT_END = BELIEF.replace("heat: {unit: W}", "heat: {unit: W}, fan: {unit: '1'}").replace(

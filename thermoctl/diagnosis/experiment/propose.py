@@ -54,7 +54,6 @@ DECIDES = 20.0  # D that decides: mean odds of e^(D/2) for one of two
 IN_RANGE = (
     0.09  # variance of a parameter that is new in every recording: anything within its range (z from 0 to 1)
 )
-WORTH_RIG_TIME = 0.06  # bits, below which an experiment is not proposed
 WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
 
 Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
@@ -274,7 +273,7 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where nothing is undecided (`survivors`), nothing can be driven, or no experiment tells enough.
+    None where nothing is undecided (`survivors`) or nothing can be driven.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:
@@ -300,8 +299,6 @@ def propose(
             trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
         if trials:
             most = max(t.bits for t in trials)
-            if most < WORTH_RIG_TIME:
-                return None
             best = max((t for t in trials if t.bits >= ENOUGH * most), key=lambda t: t.bits_per_second)
             return _entry(comparison, best, len(trials)), best.excitation
     return None
