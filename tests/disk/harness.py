@@ -190,6 +190,11 @@ def _read(path: Path) -> None:
         ElementTree.fromstring(path.read_text())
     elif kind == ".png":
         assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
+    elif kind == ".mf4":
+        from asammdf import MDF
+
+        with MDF(path) as mdf:
+            assert len(mdf.get_master(0)) > 0
     elif kind == ".mcap":
         from mcap.reader import make_reader
 
