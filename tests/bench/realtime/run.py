@@ -166,7 +166,6 @@ def run_cyclictest(bench: Bench, seconds: float) -> np.ndarray:
         ).split(),
         check=True,
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
     )
     values: list[float] = []
     for line in out.read_text().splitlines():
@@ -241,7 +240,6 @@ def run_plain(bench: Bench, seconds: float) -> dict[str, Any]:
             out,
         ],
         check=True,
-        stderr=subprocess.DEVNULL,
     )
     rows = rows_of(out, 3)[100:]
     return figures(rows, rows[:0, :2])
@@ -602,7 +600,6 @@ def stress(work: Path):
             f"stress-ng --cpu 0 --vm 1 --vm-bytes 128M --hdd 1 --hdd-bytes 128M --temp-path {work} --quiet"
         ).split(),
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
     )
     try:
         yield
