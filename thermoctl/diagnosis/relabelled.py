@@ -52,23 +52,19 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
     inputs = {i.column for i in known.plant.inputs.values()}
     pairs = [h for h in swaps(known.plant, tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
-    best: tuple[float, Hypothesis, Sequence[Table]] | None = None
+    best: tuple[float, Hypothesis, Case] | None = None
     for h in pairs:
-        other: Sequence[Table] = [h.change(t) for t in tables]
+        budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
-            again = case(
-                known.plant, other, known.catalogue, Budget(limits.fits, stopped=known.budget.stopped)
-            )
+            again = case(known.plant, [h.change(t) for t in tables], known.catalogue, budget)
             score = fitted(again, again.plant, (), again.null).log_evidence
         except (SimulationError, InputError, np.linalg.LinAlgError):
             continue
         if score > now[frozenset()] + proof and (best is None or score > best[0]):
-            best = score, h, other
+            best = score, h, again
     if best is None or known.budget.stopped():
         return None
-    _, h, other = best
-    budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
-    again = case(known.plant, other, known.catalogue, budget)
+    _, h, again = best
     leader, present = search(again, limits).tried[0], found.searched.tried[0]
     if leader.score <= max(now.values()) + proof:
         return None
