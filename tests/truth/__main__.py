@@ -1,6 +1,6 @@
 """Judge the diagnosis on frozen cases: make (once), diagnose, compare with an older result.
 
-    python -m tests.truth [--number 60] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
+    python -m tests.truth [--number 60] [--seed S] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
 
 OUT/result.json holds the result. A diagnosis is kept for the same case and the same program: run it again to continue.
 docs/proof/truth.md shows what this prints.
@@ -42,7 +42,7 @@ def cases(a: argparse.Namespace) -> list[Case]:
     wanted = a.only.split(",")
     found = [*(home(say) if "home" in wanted else ()), *(foreign(say) if "foreign" in wanted else ())]
     if {"closed", "open"} & set(wanted):
-        made = generated(a.out / "cases", (a.number + 1) // 2, a.workers, say)
+        made = generated(a.out / "cases", (a.number + 1) // 2, a.workers, say, a.seed)
         found += [c for c in made if c.group in wanted]
     return found
 
@@ -95,6 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command: 1 when a diagnosis failed."""
     p = argparse.ArgumentParser(prog="python -m tests.truth", description=__doc__.splitlines()[0])
     p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
+    p.add_argument("--seed", type=int, help="other generated cases: those of this seed, in both worlds")
     p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
     p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     p.add_argument("--out", type=Path, default=Path("build/truth"))

@@ -46,13 +46,16 @@ class Case:
         return TOLERATED if self.tolerates(name) else STRAY
 
 
-def generated(folder: Path, number: int, workers: int, say: Callable[[str], None]) -> list[Case]:
-    """Return the first `number` cases of each world; those that are not there are made."""
-    root = folder / _generator()
+def generated(
+    folder: Path, number: int, workers: int, say: Callable[[str], None], seed: int | None = None
+) -> list[Case]:
+    """Return the first `number` cases of each world, of its frozen seed or of `seed`; those that are not there are made."""
+    root = folder / (_generator() if seed is None else f"{_generator()}-{seed}")
+    seeds = SEEDS if seed is None else dict.fromkeys(SEEDS, seed)
     todo = [
         (world, n)
         for n in range(number)
-        for world in SEEDS
+        for world in seeds
         if not (root / world / f"{n + 1:04d}" / "answer.yaml").exists()
         and not (root / world / f"{n + 1:04d}.gap").exists()
     ]
@@ -60,15 +63,16 @@ def generated(folder: Path, number: int, workers: int, say: Callable[[str], None
         say(f"{len(todo)} cases to make")
         with ProcessPoolExecutor(min(workers, len(todo))) as pool:
             for done in as_completed(
-                [pool.submit(_make, root / world, SEEDS[world], world, n) for world, n in todo]
+                [pool.submit(_make, root / world, seeds[world], world, n) for world, n in todo]
             ):
                 say(done.result())
     found = []
-    for world in SEEDS:
+    mark = "" if seed is None else f"-{seed}"
+    for world in seeds:
         for n in range(number):
             case = root / world / f"{n + 1:04d}"
             if (case / "answer.yaml").exists():
-                found.append(_generated(world, case))
+                found.append(_generated(world, f"{world}{mark}-{case.name}", case))
     return found
 
 
@@ -88,7 +92,7 @@ def _make(folder: Path, seed: int, world: str, number: int) -> str:
     return f"{world}/{name} made"
 
 
-def _generated(world: str, folder: Path) -> Case:
+def _generated(world: str, name: str, folder: Path) -> Case:
     answer = load(folder / "answer.yaml").plain()
     truth = Truth.of(folder.name, answer)
     known = truth.effects if truth.kind not in ("none", "unknown") else []
@@ -97,7 +101,7 @@ def _generated(world: str, folder: Path) -> Case:
         """Return the test of a name for being this true effect, or one that the data cannot tell from it, at its place."""
         return lambda name: truth.names(name, true) and truth.at(name)
 
-    return Case(world, _job(f"{world}-{folder.name}", folder), answer, tuple(map(is_it, known)))
+    return Case(world, _job(name, folder), answer, tuple(map(is_it, known)))
 
 
 def _job(name: str, folder: Path, held_out: tuple[str, ...] = ()) -> Job:

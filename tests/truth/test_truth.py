@@ -57,10 +57,10 @@ def test_a_generated_case_takes_an_equivalent_name_and_is_a_trap_without_an_effe
         "nearly_the_same": ["natural_convection"],
         "kind": "one",
     }
-    case = a_case(tmp_path / "0001", answer, lambda f: made._generated("closed", f))
+    case = a_case(tmp_path / "0001", answer, lambda f: made._generated("closed", f"closed-{f.name}", f))
     assert [case.judge(n) for n in (("natural_convection", "a"), ("radiation", "b"))] == ["right", "stray"]
     strange = {"verdict": "unexplained", "effects": [["?", "a"]], "nearly_the_same": [], "kind": "unknown"}
-    trap = a_case(tmp_path / "0002", strange, lambda f: made._generated("closed", f))
+    trap = a_case(tmp_path / "0002", strange, lambda f: made._generated("closed", f"closed-{f.name}", f))
     assert not trap.wanted and trap.judge(("radiation", "a")) == "stray"
 
 
