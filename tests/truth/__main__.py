@@ -2,8 +2,8 @@
 
     python -m tests.truth [--number 60] [--seed S] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
 
-OUT/result.json holds the result. A diagnosis is kept for the same case and the same program: run it again to continue.
-docs/proof/truth.md shows what this prints.
+OUT/result.json holds the result. A diagnosis is kept for the same case and the same program: run it again to
+continue. docs/proof/truth.md shows what this prints.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The cases by which a diagnosis is judged, each with what is right, tolerated and wrong in it.
 
-- generated: the first cases of two frozen seeds, closed and open world; made once, kept by the generator's hash
+- generated: the first cases of two frozen seeds, closed and open world; made once, kept by the generator's
+  hash
 - home: the rigs of THERMOCTL_RECORDINGS (tests/proof/rigs.py)
 - foreign: the systems of THERMOCTL_FOREIGN, a folder of folders with plant.yaml, recordings and answer.yaml
 """
@@ -31,7 +32,8 @@ RIGHT, TOLERATED, STRAY = "right", "tolerated", "stray"
 class Case:
     """One case: its group, its job, the answer, and a judge of a name: RIGHT, TOLERATED or STRAY.
 
-    `wanted`: for each effect that is to be named, whether a name is it; none of them: a trap, where every name is wrong."""
+    `wanted`: for each effect that is to be named, whether a name is it; none of them: a trap, where every
+    name is wrong."""
 
     group: str
     job: Job

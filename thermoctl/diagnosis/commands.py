@@ -1,6 +1,4 @@
-"""The command `diagnose`, and `effects save`.
-
-Progress while they work, a summary for a person, JSON for a program."""
+"""The commands `diagnose` and `effects save`: progress, a summary for a person, JSON for a program."""
 
 from __future__ import annotations
 
@@ -115,7 +113,7 @@ def diagnose(args: argparse.Namespace) -> int:
         )
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
-        """Diagnose the recordings given, and those that the experiments added."""
+        """Diagnose the recordings of the command line, and those that --resolve has recorded since."""
         added = read_recordings(
             plant, recordings[len(args.recordings) :]
         )  # of --resolve: written by thermoctl
@@ -166,7 +164,7 @@ def _resolved(
 
 
 def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """NAME=LOW:HIGH of each. Raises InputError."""
+    """Return the range of each NAME=LOW:HIGH. Raises InputError."""
     out = {}
     for text in told:
         name, _, span = text.partition("=")

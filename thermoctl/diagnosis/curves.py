@@ -16,8 +16,8 @@ from thermoctl.plant.simulate import Excitation
 class Curve:
     """One output in one recording: `t` s and `y` (N,), NaN where not measured.
 
-    `errors`: measured minus simulated (N,), by `before` (the plant as it came), `refit_only` and `after` (the
-    extended plant). `held_out`: the simulations were not fitted to these readings."""
+    `errors`: measured minus simulated (N,) of the plants `before` (as given), `refit_only` and `after` (with
+    the findings). `held_out`: the simulations were not fitted to these readings."""
 
     recording: str
     output: str
@@ -55,7 +55,7 @@ class Curve:
 def curves_of(
     plant: Plant, drives: Sequence[Excitation], errors: Mapping[str, Sequence[np.ndarray]], held_out: bool
 ) -> Iterator[Curve]:
-    """Yield a curve for each output that a recording measured, with the simulations that there are."""
+    """Yield a curve for each measured output of each recording, with the errors that are known."""
     known = {k: e for k, e in errors.items() if len(e)}
     for r, d in enumerate(drives):
         for j, o in enumerate(plant.outputs.values()):

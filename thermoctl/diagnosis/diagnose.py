@@ -77,7 +77,7 @@ def sought(
     stopped: Callable[[], bool] = lambda: False,
     memory: Memory = NOTHING,
 ) -> Sought:
-    """Try the hypotheses; arguments as of `diagnose`. Raises InputError."""
+    """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
     chosen_on, reserve = split(tables, held_out)
     known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
@@ -86,7 +86,7 @@ def sought(
 
 
 def decided(sought: Sought) -> Diagnosis:
-    """Return what a search says: posterior, findings and their worth, remainder, verdict, missing flow."""
+    """Decide a search: posterior, findings and their worth, remainder, verdict, missing flow."""
     found = _decided(sought)
     if found.decision.verdict != "consistent" and not found.shown and found.before.node:
         found = replace(found, missing_flow=missing_flow(sought.case, found.null, found.before.node))
@@ -108,7 +108,7 @@ def _decided(sought: Sought) -> Diagnosis:
         stand = supported(likeliest, physics)  # the other effects are part of the remainder
         found = stand if stand in fits else likeliest
         kept = found
-        # of known physics that leaves only noise, no part is a misfit that it imitates
+        # beside known physics whose residual is only noise, there is no misfit that it could imitate
         if reserve or any(key[0] == LAW for key in found) or not only_noise(known, fits[found], numbers):
             kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
         best = with_residuals(known, fits[kept]) if kept else null
@@ -138,7 +138,7 @@ def _decided(sought: Sought) -> Diagnosis:
         unknown.probability,
     )
     decision = decide(posterior, facts, numbers)
-    doubt = unknown.told(decision.verdict, numbers)
+    doubt = unknown.doubt(decision.verdict, numbers)
     return Diagnosis(
         known,
         searched,
@@ -177,6 +177,6 @@ def _law(
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:
-    """Return the root of the outputs' mean ratio of mean squares; infinite if a simulation failed."""
+    """Return the rms over outputs of the ratio of their rms errors; infinite if a simulation failed."""
     pairs = [(after.get(o, float("inf")), before[o]) for o in before if before[o] > 0]
     return (sum((a / b) ** 2 for a, b in pairs) / max(len(pairs), 1)) ** 0.5

@@ -10,7 +10,7 @@ from thermoctl.shipped import shipped
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Meanings and provenance: config/diagnosis.yaml."""
+    """The numbers by their names. config/diagnosis.yaml states the meaning and origin of each."""
 
     beam: int
     shortlist: int

@@ -1,13 +1,14 @@
-"""Wrong columns as rivals of physics, once that was found: swapped ones, and gains that no sensor has.
+"""Findings of a diagnosis that wrong columns explain better: swapped columns, and gains that no sensor has.
 
 The checks before a diagnosis find swapped columns where nothing else is missing. Here each pair is swapped
-in the recordings, which holds the same numbers under other names. So their log evidence is compared:
+in the recordings. These hold the same numbers under other names, so that log evidences can be compared:
 
     swapped where  score(best with the pair swapped) - score(best as recorded) > log(RARITY pairs)
               and  misfit(best with the pair swapped) < HALF misfit(best as recorded), if that leaves one
 
-A real plant is wrong in small ways, and its evidence counts each by hundreds of nats: so a misfit has to
-fall, too. An input and an output are no pair: a run that is given a reading predicts it without physics.
+A real plant is wrong in small ways, and each may change its evidence by hundreds of nats: so a misfit has to
+fall, too. An input and an output are no pair: a simulation that is driven by a reading predicts it without
+physics.
 Only a pair that improves the plant without effects by as much is searched for effects.
 """
 
@@ -30,16 +31,16 @@ from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-GAINS = (0.3, 1.5)  # of a sensor: a stem in still air reads a third at worst; 1.8 is degF for degC
-HALF = 0.5  # of the misfit: a swap that is true takes nearly all of what it caused
+GAINS = (0.3, 1.5)  # of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for degC
+HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all of it
 GAIN, SIZE = "sensor_gain", "A"
 
 
 def relabelled(found: Diagnosis, tables: Sequence[Table], limits: Thresholds) -> list[Finding]:
-    """Return severe findings where a wrong column explains the recordings better than what was found.
+    """Return severe findings where a wrong column explains the recordings better than the diagnosis.
 
     `tables`: the recordings that took part in the choice, as they were given. A diagnosis that goes on from
-    an earlier one is not asked: the earlier recordings are gone."""
+    an earlier one is not checked: the earlier recordings are not there."""
     if found.decision.verdict == "consistent" or found.case.memory.recordings:
         return []
     where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
@@ -83,7 +84,7 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
 
 
 def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:
-    """Return the sum over outputs of the mean square over the noise, as far as it is above the noise."""
+    """Return the sum over outputs of the residual's mean square over the noise, above `clean` squared."""
     return sum(max(x**2 - limits.clean**2, 0.0) for x in over_noise(case, f))
 
 
@@ -96,7 +97,7 @@ def _listed(effects: Sequence[Placed]) -> str:
 
 
 def absurd(found: Diagnosis, where: str) -> list[Finding]:
-    """Return a finding for each gain that would be named and that no sensor has."""
+    """Return a finding for each named gain that no real sensor has."""
     findings = []
     for e in found.shown:
         if e.key[0] != GAIN or SIZE not in e.own:

@@ -67,7 +67,7 @@ def diagnose(
     - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
     - `report`: write report.html, too
-    - `anyway`: also where wrong columns explain the recordings better than physics
+    - `anyway`: write the result even where wrong columns explain the recordings better than physics
 
     Raises InputError for unusable inputs."""
     if not tables:
@@ -132,7 +132,7 @@ def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
 
 
 def _remembered(found: Diagnosis) -> memory.Memory:
-    """Return what is kept for a diagnosis that goes on: the likeliest hypotheses, and that of no effect."""
+    """Return the memory for a later diagnosis: the likeliest hypotheses, and the plant without effects."""
     kept = [
         w.fitted
         for k, w in enumerate(found.searched.tried)
@@ -172,7 +172,7 @@ def writable(folder: Path) -> Path:
 
 
 def _distinct(tables: Sequence[Table]) -> list[Table]:
-    """Return the tables with names that differ: that of the folder is put before a name that comes twice."""
+    """Return the tables with distinct names: a name that occurs twice gets its folder's name in front."""
     names = [t.name for t in tables]
     return [
         t if names.count(t.name) == 1 else dataclasses.replace(t, name=f"{Path(t.path).parent.name}_{t.name}")

@@ -1,4 +1,4 @@
-"""The commands `effects` and `diagnose --explain`: they only read, so they load neither models nor fits."""
+"""The commands `effects` and `diagnose --explain`. They only read files, so no simulation code is loaded."""
 
 from __future__ import annotations
 

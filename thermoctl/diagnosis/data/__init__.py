@@ -1,1 +1,1 @@
-"""The recordings of a diagnosis as rows: outliers, blocks, frequencies, and what earlier recordings left."""
+"""Recordings of a diagnosis: outliers, means over blocks, frequencies, and memory of earlier recordings."""

@@ -1,4 +1,4 @@
-"""The recordings that take part in the choice, and the plant as it came."""
+"""The data of a diagnosis: recordings that the choice is made on, the original plant and its first refit."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from thermoctl.plant.whitening import Noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-LEAST = 40  # measured values of one output, below which nothing is decided
-STATED = 12  # the same where the plant file states the noise, which then is not estimated from them
-ACCURATE = 1e-3  # local error of a simulation over noise / range of an output; at most LARGEST
+LEAST = 40  # least number of measured values of at least one output
+STATED = 12  # least number if the plant file states the output's noise, so that it is not estimated
+ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
-TOLD = 6  # times of outliers that a note lists of each column
-LATER = 2.5  # refits after a later screening: mean of 26 diagnoses of real and shared rigs
+TOLD = 6  # largest number of outliers' times that a note lists for a column
+LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
 
 
 Outliers = tuple[tuple[str, str, tuple[float, ...]], ...]  # recording, column, times in s
@@ -43,12 +43,12 @@ Outliers = tuple[tuple[str, str, tuple[float, ...]], ...]  # recording, column, 
 
 @dataclass
 class Budget:
-    """Largest number of refits, and the number done. Counted, never timed: the same on every machine.
+    """Largest number of refits, and the number done. It counts refits, not time: the same on every machine.
 
     - `planned`: number of refits after this step of the search; each step may plan more
-    - `later`: number of hypotheses that the search may extend besides; only the time left depends on it
-    - `stopped`: does a person want the result of what is done so far?
-    - `untried`: refits of promising hypotheses left out"""
+    - `later`: number of hypotheses that the search may still extend, for the time left that progress states
+    - `stopped`: has a person asked for the result so far?
+    - `untried`: number of promising refits that were left out"""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
@@ -58,11 +58,11 @@ class Budget:
     untried: int = 0
     later: float = 0.0
     pace: Pace = field(default_factory=Pace)
-    lock: Lock = field(default_factory=Lock)  # two refits may run side by side
+    lock: Lock = field(default_factory=Lock)  # two refits may run in parallel
 
     @property
     def spent(self) -> bool:
-        """Is there nothing left for another refit?"""
+        """Is no further refit allowed?"""
         return self.fits_done >= self.fits or self.stopped()
 
     def spend(self) -> None:
@@ -87,16 +87,16 @@ class Budget:
 
     def _left(self, refits: float, screenings: float) -> str:
         planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
-        return self.pace.told({"refit": planned, "screening": screenings + self.later})
+        return self.pace.left_text({"refit": planned, "screening": screenings + self.later})
 
 
 @dataclass(frozen=True)
 class Case:
     """Data, catalogue and budget of a diagnosis.
 
-    All hypotheses are scored in the same `coordinates` and `grids`. `off`: first samples less the plant's
-    start, of the outputs that contradict it. `rtol`: local error of every simulation. `outliers`: readings
-    left out."""
+    All hypotheses are scored in the same `coordinates` and `grids`. `off`: by output, the first sample minus
+    the plant's initial value, where they contradict each other. `rtol`: relative local error of every
+    simulation. `outliers`: readings left out."""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -107,14 +107,14 @@ class Case:
     grids: tuple[Grid, ...]
     budget: Budget
     notes: list[str] = field(default_factory=list)
-    block: int = 1  # rows of the recordings whose mean is one row here
+    block: int = 1  # number of recorded rows whose mean is one row here
     off: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
     memory: Memory = NOTHING  # of earlier recordings
     outliers: Outliers = ()
 
     def drives(self, model: Model) -> list[Excitation]:
-        """The recordings as a model reads them. Models that read the same columns share their values."""
+        """Return the recordings as a model reads them. Models that read the same columns share the arrays."""
         if _readings(model) == _readings(self.null.model):
             return [dataclasses.replace(d) for d in self._read]
         return self._excitations(model)
@@ -128,7 +128,9 @@ class Case:
 
 
 def _readings(model: Model) -> list[Any]:
-    """Return all that decides how a model reads a recording; a delayed input has a column of its own."""
+    """Return all properties of a model that decide how it reads a recording.
+
+    A delayed input has a column of its own."""
     plant = model.plant
     outputs = [(o.name, o.column, o.unit, o.conversion) for o in plant.outputs.values()]
     return [*plant.inputs.values(), *model.code.inputs, *outputs]
@@ -143,7 +145,7 @@ def case(
 ) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
-    Rows of long recordings are put together (rows.py).
+    Rows of long recordings are averaged in blocks (rows.py).
     Raises InputError where too few values were measured."""
     plant, off, freed = _free_starts(plant, tables)
     fewer = reduced(plant, tables)
@@ -176,7 +178,7 @@ def case(
         [
             *freed,
             *([fewer.note] if fewer.block > 1 else []),
-            *([told(dropped)] if dropped else []),
+            *([outlier_note(dropped)] if dropped else []),
             *rig.guesses(),
         ],
         fewer.block,
@@ -204,9 +206,9 @@ def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
 
 
 def with_tables(case: Case, tables: Sequence[Table]) -> Case:
-    """Return the case with parts of its recordings, the plant refitted to them; noise and accuracy stay.
+    """Return the case with other recordings, such as parts of its own, and the plant refitted to them.
 
-    Rows that are means already stay as they are."""
+    Noise and accuracy are those of the case. Rows are not averaged again."""
     model = compile_plant(case.plant)
     drives = [dataclasses.replace(model.excitation(t), rtol=case.rtol) for t in tables]
     null = fit(model, drives, case.noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
@@ -220,7 +222,7 @@ def with_tables(case: Case, tables: Sequence[Table]) -> Case:
 def _grids(
     coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, rows: Reduced
 ) -> tuple[Grid, ...]:
-    """Return the frequencies of each measured output."""
+    """Return the frequency grid of each measured output."""
     sensors = [rows.sensor(o.noise) for o in null.model.plant.outputs.values()]
     change = _changes(null, drives, rows.block)
     return tuple(
@@ -232,7 +234,7 @@ def _grids(
 def _changes(null: Fit, drives: Sequence[Excitation], block: int) -> np.ndarray:
     """Return the rms change of each output in a sampling interval, over the root of `block`.
 
-    The fastest hundredth is left out: there an input that is held jumps, at a time that is known."""
+    The fastest hundredth is left out: these are jumps of a held input, whose times are known."""
     squares = []
     for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True):
         slope = np.abs(np.gradient(null.model.run(d, values, dx0).y, d.t, axis=0))
@@ -242,9 +244,9 @@ def _changes(null: Fit, drives: Sequence[Excitation], block: int) -> np.ndarray:
 
 
 def _rtol(drives: Sequence[Excitation], noise: Sequence[Noise]) -> float:
-    """Return the local error whose sum stays far below the sensors' noise.
+    """Return the relative local error of simulations at which their total error is far below the noise.
 
-    With ACCURATE times noise over range it was 0.001 to 0.02 of the noise on six real rigs."""
+    It is ACCURATE times noise over range. The total error was 0.001 to 0.02 of the noise on six real rigs."""
     values = np.concatenate([d.y for d in drives])
     seen = np.isfinite(values).any(axis=0)
     span = np.nanmax(values[:, seen], axis=0) - np.nanmin(values[:, seen], axis=0)
@@ -253,9 +255,10 @@ def _rtol(drives: Sequence[Excitation], noise: Sequence[Noise]) -> float:
 
 
 def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str, float], list[str]]:
-    """Return the plant with free starts of bodies that first samples contradict, `Case.off`, and notes.
+    """Free the initial states that first samples contradict; return the plant, `Case.off` and notes.
 
-    Such a start is not known. A refit that is bound to it would take the way back from it for physics."""
+    Such an initial state is wrong in the plant file. If it were kept, effects would be found that explain the
+    transient from it."""
     model, nodes = compile_plant(plant), dict(plant.nodes)
     found: dict[str, list[float]] = {}
     for table in tables:
@@ -289,10 +292,10 @@ def _without_outliers(
     as_stated: Sequence[np.ndarray],
     noise: Sequence[Noise],
 ) -> tuple[list[Table], Outliers]:
-    """The recordings without cells whose residual lies far from its neighbours', and which those are.
+    """Return the recordings without cells whose residual is far from its neighbours', and these cells.
 
-    `as_stated`: residuals with the stated starts. The first readings, up to which these predict all, are no
-    outliers: a refit that moved a start may have left them far behind."""
+    `as_stated`: residuals with the stated initial states. First readings that these predict are no outliers:
+    their large residual is due to an initial state that the refit moved."""
     out, dropped = [], []
     for t, e, stated in zip(tables, residuals, as_stated, strict=True):
         columns = dict(t.columns)
@@ -312,8 +315,8 @@ def _without_outliers(
     return out, tuple(dropped)
 
 
-def told(outliers: Outliers) -> str:
-    """Return which readings were left out, as a sentence."""
+def outlier_note(outliers: Outliers) -> str:
+    """Return a sentence that lists the readings that were left out."""
     count = sum(len(times) for *_, times in outliers)
     places = []
     for recording, column, times in outliers:

@@ -1,8 +1,8 @@
 """Residuals in frequency: the orthonormal DCT-II of each output's measured samples in each recording.
 
-There a stationary noise is nearly independent from row to row, with its spectral density as variance
-(Whittle's likelihood); a random walk is, too. Missing samples are left out and the others joined: exact for
-white noise.
+The rows of a stationary noise are nearly independent, with its spectral density as variance (Whittle's
+likelihood). So are those of a random walk. Missing samples are left out and the others joined: this is exact
+for white noise.
 
     R = DCT(e),   log p(e | V) = -1/2 sum_k (log 2 pi V_k + R_k^2 / V_k)
 
@@ -22,9 +22,9 @@ from thermoctl.plant.simulate import Excitation
 from thermoctl.plant.whitening import measured
 
 SINGLE = 6  # lowest rows that are bands of their own
-WIDTH = 1.19  # of a band: a quarter of an octave
-SHORT = 4_000  # samples whose DCT takes no time whatever their number
-FEWEST = 8  # samples of an output in a recording, below which it says nothing
+WIDTH = 1.19  # ratio of a band's ends: a quarter of an octave
+SHORT = 4_000  # up to so many samples a DCT is fast for any number of them
+FEWEST = 8  # an output with fewer measured samples in a recording is not used there
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,9 @@ def band_edges(rows: int) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _bands(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the edges of the bands, the rows in each, and the band of each row: channels share them."""
+    """Return the edges of the bands, the number of rows in each, and the band of each row.
+
+    Channels share these arrays."""
     edges = band_edges(rows)
     count = np.diff(edges)
     band = np.repeat(np.arange(len(count)), count)
@@ -67,7 +69,9 @@ def _bands(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel | None:
-    """Output j of recording r; at most about `most` rows (the lowest). None where too little was measured."""
+    """Return the channel of output j in recording r; None where too little was measured.
+
+    `most`: about the largest number of rows, the lowest ones."""
     index = measured(d.y[:, j])
     if len(index) < FEWEST:
         return None
@@ -97,7 +101,7 @@ def quick(n: int) -> int:
 
 
 def transform(c: Channel, e: np.ndarray) -> np.ndarray:
-    """(N, ...) values of a channel's output at all samples as its rows (rows, ...)."""
+    """Return the DCT rows (rows, ...) of a channel from its output's values (N, ...) at all samples."""
     part = e if len(c.index) == len(e) else e[c.index]
     if c.block > 1:
         whole = len(part) // c.block * c.block
@@ -131,5 +135,5 @@ class Coordinates:
         return out
 
     def powers(self, rows: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Sum of squares of each channel's rows (rows,) in its bands (bands,)."""
+        """Return the sum of squares of each channel's rows (rows,) in each of its bands (bands,)."""
         return [np.bincount(c.band, x * x) for c, x in zip(self.channels, rows, strict=True)]

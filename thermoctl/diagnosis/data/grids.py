@@ -17,13 +17,15 @@ STATED = 1.0  # prior sd of log c^2: in one case of three a stated noise is off 
 # The error of recorded times in sampling intervals: median, and prior sd of log j^2 (a factor of ten in j).
 # A clock in hardware has 1e-4 or less, a program that polls a device on a busy machine 1e-1.
 CLOCK, CLOCK_SD = 3e-3, 2 * np.log(10.0)
-# Of the noise's variance, from which an error of the times, two sd above the median, is looked for
+# A time error is part of the noise model if, two sd above its median, it adds this share of the variance.
 SEEN = 0.1
-SMALL = 0.02  # of an output's swing: width of the prior of the remainder's rms
+SMALL = 0.02  # width of the prior of the remainder's rms, as a share of the output's swing
 # Prior sd of u (noise.py) at the lowest frequency: one sd is a factor of ten in the remainder's rms.
 LEVEL = 2 * np.log(10.0)
 DRAWS = 400  # random walks drawn for the normalisation of the remainder's prior
-WALK = np.log(4.0)  # standard deviation of u's step over an octave: 1/f^2, a white force on one storage
+# Standard deviation of u's step over an octave. The spectrum of a white force on one storage, 1/f^2, falls by
+# this factor of 4 an octave.
+WALK = np.log(4.0)
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,9 @@ class Grid:
     node: np.ndarray
     count: np.ndarray
     block: int  # samples whose mean is one row of the recordings
-    turn: np.ndarray  # angle in a sampling interval
+    turn: np.ndarray  # (nodes,) angle of each frequency in a sampling interval, rad
     shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
-    slow: np.ndarray  # (starts, nodes) the same of noise with slow parts
+    slow: np.ndarray  # (starts, nodes) likewise, of a noise with slow parts, at each row of STARTS
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # its log determinant
@@ -50,7 +52,7 @@ class Grid:
     sensor: SensorNoise | None  # the parts of the stated noise
 
     def power(self, powers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the power at each frequency (nodes,) from the bands' of all channels of all outputs."""
+        """Return the power at each frequency (nodes,). `powers`: by band, of all channels of all outputs."""
         return np.bincount(self.node, np.concatenate([powers[k] for k in self.channels]))
 
     @property
@@ -60,28 +62,28 @@ class Grid:
 
     @cached_property
     def clock(self) -> float:
-        """Variance by the times' median error, over the stated noise's; 0 where it would not be seen."""
+        """Variance by the median error of the times, over the stated noise's; 0 if negligible (SEEN)."""
         ratio = (CLOCK * self.change / self.sigma) ** 2
         return ratio if ratio * np.exp(2 * CLOCK_SD) > SEEN else 0.0
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """Prior sd of log c^2 and, where it is looked for, of log j^2."""
+        """Prior sd of log c^2 and, if a time error is part of the noise model, of log j^2."""
         return np.array([self.known, CLOCK_SD] if self.clock else [self.known])
 
     @property
     def timing(self) -> float:
-        """Variance by an error of the times that is one prior sd above the median."""
+        """Variance that an error of the times adds which is one prior sd above its median."""
         return float(self.variance * self.clock * np.exp(CLOCK_SD))
 
     @property
     def most(self) -> float:
-        """Variance of the noise, its parts one prior sd above their medians."""
+        """Variance of the noise with all its parts one prior sd above their medians."""
         return self.variance * float(np.exp(self.known)) + self.timing
 
     @property
     def small(self) -> float:
-        """Square of the prior width of the remainder's rms, q."""
+        """The square of the prior width of the remainder's rms: q of noise.py."""
         return (SMALL * self.swing) ** 2
 
 
@@ -94,12 +96,14 @@ def grid(
     sensor: SensorNoise | None = None,
     block: int = 1,
 ) -> Grid:
-    """Return the frequencies of one output.
+    """Return the frequency grid of one output.
 
-    `positions`: of its channels; `sigma`: its stated noise; `swing`: its rms about the mean. `change`: its
-    rms change in a sampling interval, over the root of `block`. `sensor`: the parts of the noise, where the
-    plant file states them. `block`: samples whose mean is one row. A mean of samples has the spectrum of the
-    samples, divided by their number: slow parts keep their size and time."""
+    - `positions`: of its channels
+    - `sigma`: standard deviation of its stated noise; `sensor`: the parts of that noise, if stated
+    - `swing`: its rms about the mean
+    - `change`: its rms change in a sampling interval, over the root of `block`
+    - `block`: number of samples whose mean is one row. Such a mean has the spectrum of the samples, divided
+      by their number: slow parts keep their size and time"""
     channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)

@@ -1,11 +1,12 @@
-"""The posterior that earlier recordings left of each hypothesis: a diagnosis goes on without their data.
+"""The posterior of each hypothesis from earlier recordings: a diagnosis goes on without their data.
 
     log p(D_new, D_old | h) = log p(D_old | h) + log p(D_new | D_old, h)
 
 The second term is the evidence of the new recordings. Its prior is the posterior of the old ones: a Gaussian
 about the old optimum z with the curvature H there, own initial states eliminated. Noise and remainder are
-averaged for each part of the data alone. A hypothesis that the old diagnosis did not try has the prior of its
-largest part that was tried. Of its other effects the old recordings tell nothing.
+averaged for each part of the data alone. For a hypothesis that the old diagnosis did not try, the prior is
+the posterior of the largest tried hypothesis that it contains. Its other effects then have their original
+priors.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from thermoctl.yamlfile import InputError
 
 FILE = "memory.json"
 FORMAT = "thermoctl-memory/1"
-KEPT = 12  # likeliest hypotheses that are remembered, beside the plant without any effect
+KEPT = 12  # number of likeliest hypotheses that are remembered, beside the plant without any effect
 
 Key = tuple[str, str]
 
@@ -41,10 +42,10 @@ class PlacedBefore:
 
 @dataclass(frozen=True)
 class Past:
-    """The posterior that the old recordings left of one hypothesis.
+    """The posterior of one hypothesis from the old recordings: a Gaussian.
 
-    - `unknowns` (k,): parameters that all recordings share, `spans` their ranges; `z` (k,) their optimum in
-      these, `precision` (k, k)
+    - `unknowns` (k,): names of the parameters that all recordings share; `spans`: their ranges
+    - `z` (k,): their optimum, 0..1 in the ranges; `precision` (k, k)
     - `squares`, `counts`: sum of squared residuals and number of rows of each output"""
 
     effects: tuple[PlacedBefore, ...] = ()
@@ -64,13 +65,13 @@ class Past:
 
 @dataclass(frozen=True)
 class Memory:
-    """All remembered hypotheses, and the names of the recordings that they rest on."""
+    """All remembered hypotheses, and the names of the recordings that they were fitted to."""
 
     hypotheses: tuple[Past, ...] = ()
     recordings: tuple[str, ...] = ()
 
     def of(self, keys: frozenset[Key], plant: Plant) -> Past:
-        """Return what is known of a hypothesis, else of the largest, then likeliest, part of it."""
+        """Return the posterior of a hypothesis, else of the largest, then likeliest, one that it contains."""
         ranges = {n: p.range for n, p in plant.parameters.items()}
         parts = [
             h

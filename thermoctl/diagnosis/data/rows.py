@@ -5,22 +5,22 @@ time, one row at the middle of each block:
 
     y = yhat(middle) + mean over the block (y - yhat)
 
-yhat is the run of the plant, refitted to coarse means. It carries what is fast in the outputs. So only the
+yhat is the run of the plant, refitted to coarse means. It holds the fast changes of the outputs. So only the
 plant's error has to be smooth over a block. White noise of standard deviation s becomes s / sqrt(block).
 
-Where an input jumps, a block ends and the next begins: no block mixes readings of before and after. The
-last rows before a jump, fewer than a block, give no value. A held input keeps the exact times of its changes:
+A block ends where an input jumps, so that it does not mix readings from before and after the jump. The
+rows left before a jump, fewer than a block, give no value. A held input keeps the exact times of its changes:
 each has a row of its own, without outputs. An input that changes too often for that is averaged.
 
 `block` is the largest number that passes three tests in every recording:
 
 - The plant's error is white above half of the new highest frequency. No band of DCT rows there has more
-  power than the highest half of all rows. No single row has: an oscillation is one (Fisher 1929).
+  power than the highest half of all rows, and no single row (an oscillation) has (Fisher 1929).
 - Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
   in an input keep their mean.
-- The means keep the information on each parameter and initial state, and on a delay of each output. It
-  is 1 / diag([J'J + prior]^-1): all others are unknown, too. A delay changes a reading by its slope.
-  That is as fast as any effect's change.
+- The means keep the information on each parameter and initial state, and on a delay of each output. The
+  information is 1 / diag([J'J + prior]^-1), with all other unknowns free. A delay changes a reading in
+  proportion to its slope, as fast as any effect does.
 """
 
 from __future__ import annotations
@@ -46,23 +46,24 @@ from thermoctl.plant.whitening import Noise, default_noise
 from thermoctl.recording.table import Table
 
 # None of these numbers chooses a hypothesis.
-WIDER = 1.05  # largest factor on an unknown's standard deviation
+WIDER = 1.05  # largest factor by which averaging may increase an unknown's standard deviation
 LOST = 0.05  # largest share of the rows that are left out before jumps
-LONG = 12_000  # rows of all recordings, up to which a diagnosis takes seconds: all are kept
-FEWEST = 1_000  # rows that each recording keeps: forty bands, the highest with a tenth of them
+LONG = 12_000  # up to so many rows in all recordings a diagnosis takes seconds: no row is averaged
+# Least number of rows of an averaged recording: forty bands, a tenth of the rows in the highest.
+FEWEST = 1_000
 # At half of the new highest frequency the mean of a block keeps sinc(1/4)^2 = 81 % of the power.
 # Faster content has at most WHITE - 1 = 10 % of the noise's power: 2 % of the highest band are lost.
 HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
-WHITE = 1.1  # times the power of the highest rows, up to which a band is white
-CHANCE = 1e-3  # that white noise of any output in any recording fails one of the two tests
-AVERAGED = 1e-3  # share of an input's variance that averaging may remove: the mean of its square is as exact
-OUTLIER = 6.0  # robust standard deviations from the median of its neighbours, beyond which a cell is dropped
-GAP = 1.5  # times the usual duration of a block, beyond which rows are missing in it: it gives no value
+WHITE = 1.1  # a band is white up to so many times the power of the highest rows
+CHANCE = 1e-3  # chance that white noise of any output in any recording fails the tests of bands or of rows
+AVERAGED = 1e-3  # share of an input's variance that averaging may remove: its mean square is as exact
+OUTLIER = 6.0  # a cell so many robust standard deviations from the median of its neighbours is dropped
+GAP = 1.5  # a block that lasts so many times the usual duration lacks rows: it gives no value
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """Recordings with fewer rows; `block`: rows that became one; `before`, `after`: number of rows of all."""
+    """Recordings with fewer rows. `block`: number of rows averaged to one; `before`, `after`: rows in all."""
 
     tables: list[Table]
     block: int
@@ -70,7 +71,7 @@ class Reduced:
     after: int
 
     def noise(self, plant: Plant, drives: Sequence[Excitation]) -> tuple[Noise, ...]:
-        """Return the noise of each output's rows."""
+        """Return the noise of each output in the averaged rows."""
         full = default_noise(plant, drives)
         if self.block == 1:
             return full
@@ -80,14 +81,14 @@ class Reduced:
         )
 
     def sensor(self, noise: object) -> SensorNoise | None:
-        """Return the parts of a stated noise in these rows."""
+        """Return the parts of a stated noise in the averaged rows; None if only a number is stated."""
         if not isinstance(noise, SensorNoise):
             return None
         return dataclasses.replace(noise, white=noise.white / np.sqrt(self.block))
 
     @property
     def note(self) -> str:
-        """Return how many rows were needed, as a text for the result."""
+        """Return a sentence for the result: how many rows were averaged to one."""
         return (
             f"{self.after} of {self.before} rows were needed: means of {self.block} rows hold the same information; "
             "noise and errors below are those of the means"
@@ -95,7 +96,7 @@ class Reduced:
 
 
 def _averaged_sd(sigma: float, noise: object, block: int) -> float:
-    """Return the standard deviation of a mean of `block` values, whose white part only becomes smaller."""
+    """Return the standard deviation of a mean of `block` values: only the white part becomes smaller."""
     white = noise.white if isinstance(noise, SensorNoise) else sigma
     return float(np.sqrt(max(sigma**2 - white**2 * (1 - 1 / block), 0.0)))
 
@@ -132,7 +133,7 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
 def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float) -> int:
     """Return the largest block, at most `coarse`, that a recording allows.
 
-    `chance`: that an output's white noise fails a test."""
+    `chance`: the probability that an output's white noise fails a test."""
     model, d = of[0], of[0].excitation(of[1])
     problem = Problem(model, [d], default_noise(model.plant, [d]))
     run = model.run(d, values, dx0, sensitivities=True, states=False)
@@ -141,7 +142,7 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
     content = max(_content(e, chance) for e in (d.y - run.y).T)
 
     def columns(j: int) -> np.ndarray:
-        """Whitened changes (N, k + 1) of an output's readings by the unknowns, then by its delay."""
+        """Return the whitened slopes (N, k + 1) of an output's readings by the unknowns and by its delay."""
         assert run.dy is not None
         by = np.column_stack([run.dy[:, j, used] * slope, np.gradient(run.y[:, j], d.t)])
         return np.where(np.isfinite(d.y[:, j, None]), by / problem.noise[j].sigma, 0.0)
@@ -155,12 +156,12 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 
     sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
-    at = bisect_left(sizes, True, key=enough)  # the larger a block, the more it loses
+    at = bisect_left(sizes, True, key=enough)  # the larger a block, the more information is lost
     return sizes[at] if at < len(sizes) else 1
 
 
 def _sizes(most: int) -> list[int]:
-    """Return the blocks to try, the largest first. They are odd: so the middle is a row."""
+    """Return the block sizes to try, the largest first. They are odd, so that the middle is a row."""
     return sorted({(int(most * 0.8**k) - 1) // 2 * 2 + 1 for k in range(40)} - {1, -1}, reverse=True)
 
 
@@ -169,8 +170,8 @@ def _information(
 ) -> np.ndarray:
     """Return the information on each of k unknowns, then on a delay of each output, in means of blocks.
 
-    `columns` of an output (N, k + 1): whitened changes of its readings by the unknowns, and by its delay, 0
-    where nothing was measured. `prior` (k,): of the unknowns."""
+    `columns` of an output (N, k + 1): whitened slopes of its readings by the unknowns, and by its delay; 0
+    where nothing was measured. `prior` (k,): prior precision of the unknowns."""
     k, rows = len(prior), starts[:, None] + np.arange(block)
     gram = np.diag(np.concatenate([prior, np.zeros(d.y.shape[1])]))
     for j in range(d.y.shape[1]):
@@ -188,7 +189,7 @@ def _information(
 
 
 def _content(y: np.ndarray, chance: float) -> int:
-    """Return the DCT row above which a signal is white. `chance`: that white noise fails a test."""
+    """Return the DCT row above which a signal is white. `chance`: probability that white noise fails."""
     y = y[np.isfinite(y)]
     if len(y) < FEWEST or not np.ptp(y):
         return 0
@@ -204,7 +205,7 @@ def _content(y: np.ndarray, chance: float) -> int:
 
 
 def _allowed(d: Excitation, block: int) -> bool:
-    """Does a block leave half of the rows or more, and does each input keep its changes or its variance?"""
+    """Do blocks of this size use half of the rows or more, and keep each input's changes or its variance?"""
     starts = _starts(d, block)
     rows = starts[:, None] + np.arange(block)
     if 2 * rows.size < len(d.t):
@@ -221,7 +222,7 @@ def _allowed(d: Excitation, block: int) -> bool:
 
 
 def _changes(d: Excitation, j: int, block: int) -> np.ndarray:
-    """Return the rows at which a held input changes; none if they are more than the blocks."""
+    """Return the rows at which a held input changes; none if there are more changes than blocks."""
     rows = np.flatnonzero(d.u[1:, j] != d.u[:-1, j]) + 1
     return rows if not d.linear[j] and len(rows) <= len(d.t) // block else rows[:0]
 
@@ -229,8 +230,8 @@ def _changes(d: Excitation, j: int, block: int) -> np.ndarray:
 def _jumps(d: Excitation, block: int) -> np.ndarray:
     """Return the rows at which a block ends because an input jumps.
 
-    Half a block of rows is lost at each. So the largest jumps, each in its input's standard deviations, are
-    taken, until LOST of the rows are lost."""
+    Each costs half a block of rows on average. So only the largest jumps are used, relative to the standard
+    deviation of their input, until the share LOST of the rows is lost."""
     size = np.zeros(len(d.t) - 1)
     for u in d.u.T:
         step = np.abs(np.diff(u))
@@ -252,9 +253,9 @@ def _starts(d: Excitation, block: int) -> np.ndarray:
 def means(
     model: Model, table: Table, block: int, values: np.ndarray | None = None, dx0: np.ndarray | None = None
 ) -> Table:
-    """Return a recording with one row a block, one a change of a held input, and two a jump of another.
+    """Return a recording with a row for each block, one for each change of a held input, two for other jumps.
 
-    `values`, `dx0`: parameters and shifts of initial states of the run that carries what is fast."""
+    `values`, `dx0`: parameters and shifts of the initial states of the run yhat."""
     table = in_plant_units(model.plant, table)
     d = model.excitation(table)
     starts, jumps = _starts(d, block), _jumps(d, block)
@@ -301,7 +302,7 @@ def _held_mean(column: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _centred(u: np.ndarray, rows: np.ndarray, block: int, jumps: np.ndarray) -> np.ndarray:
-    """Return the mean over a block about each row, shorter at jumps and ends."""
+    """Return the mean of u over a block centred on each row; at jumps and ends the block is shorter."""
     total = np.concatenate([[0.0], np.cumsum(u)])
     ends = np.concatenate([[0], jumps, [len(u)]])
     part = np.searchsorted(ends, rows, side="right")

@@ -6,8 +6,8 @@ are compared: white, white with a first-order part, and white with a 1/f part. I
 
     log p = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-Each further number costs log(rows) / 2 (Schwarz 1978). Physics that the plant lacks would be learnt as noise,
-too: so the recordings should be quiet, or the plant complete.
+Each parameter more costs log(rows) / 2 (Schwarz 1978). Physics that the plant lacks would be learnt as noise,
+too: so the inputs should be constant, or the plant complete.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-LEAST = 100  # measured values of an output from which its noise is learnt
+LEAST = 100  # least number of measured values of an output to learn its noise
 DIGITS = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class _Powers:
-    """Rows and power in each band of a channel."""
+    """A channel, and the power of its residual in each band (bands,)."""
 
     channel: Channel
     power: np.ndarray
@@ -67,13 +67,14 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
         rows = [transform(c, found.residuals[c.recording][:, j]) for c in channels]
         powers = [_Powers(c, np.bincount(c.band, x * x)) for c, x in zip(channels, rows, strict=True)]
         o = outputs[model.outputs[j]]
-        step = (o.resolution or 0.0) ** 2 / 12  # the rounding's own variance is stated apart
+        # Variance of the rounding: the plant file states it as `resolution`, so it is no part of the noise.
+        step = (o.resolution or 0.0) ** 2 / 12
         outputs[o.name] = dataclasses.replace(o, noise=_best(powers, step))
     return dataclasses.replace(plant, outputs=outputs)
 
 
 def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
-    """Return the likeliest of the three spectra, less what each further number costs."""
+    """Return the spectrum with the best Schwarz criterion. `step`: the variance of the rounding."""
     rows = sum(float(p.channel.count.sum()) for p in powers)
     total = float(np.sqrt(sum(p.power.sum() for p in powers) / rows))
     longest = max(p.channel.interval * p.channel.rows for p in powers)
@@ -93,7 +94,8 @@ def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
     best = min(tried, key=lambda x: x[0])[1]
     scale = [_scale(p, best, step) for p in powers]
     spread = float(np.var(np.log(scale)) if len(scale) > 1 else 0.0)
-    sd = np.sqrt(0.5 / rows + spread)  # of the logarithm: of one estimate, and from recording to recording
+    # Of the logarithm: the variance of one estimate, and that from recording to recording.
+    sd = np.sqrt(0.5 / rows + spread)
     return dataclasses.replace(best, sd=float(f"{sd:.{DIGITS}g}"))
 
 
@@ -114,7 +116,7 @@ def _cost(x: np.ndarray, kind: str, powers: Sequence[_Powers], total: float, ste
 
 
 def _scale(p: _Powers, noise: SensorNoise, step: float) -> float:
-    """Return a channel's rms in units of a noise."""
+    """Return the rms of a channel's residual, divided by that of a noise."""
     v = step + spectrum(noise, p.channel.frequency, p.channel.interval)
     return float(np.sqrt(np.sum(p.power / v) / p.channel.count.sum()))
 

@@ -12,12 +12,12 @@ from scipy.special import ndtr, ndtri
 
 from thermoctl.plant.language import SensorNoise
 
-# Slow parts of a noise that nobody stated: least and largest size and time of a first-order part, and size
-# of a 1/f part. Sizes are standard deviations (of the 1/f part over a decade), as shares of the white part's.
-# The time is in sampling intervals. Slower or larger errors belong to the remainder: as noise they would
-# imitate physics.
+# Slow parts of a noise, if the plant file states none. The rows are [least, largest] size and time constant
+# of a first-order part, and size of a 1/f part. Sizes are standard deviations (of the 1/f part over a
+# decade), as shares of the white part's. The time constant is in sampling intervals. Slower or larger errors
+# belong to the remainder: as noise they would hide physics.
 SLOW = np.log([[0.1, 1.0], [0.5, 15.0], [0.01, 0.1]])
-# Sizes and times, as `slow_parts` takes them, of equal prior probability: a search starts at the likeliest.
+# Points x of `slow_parts` with equal prior probability. The search for a maximum starts at the likeliest one.
 STARTS = np.array([*product(*(ndtri((np.arange(n) + 0.5) / n) for n in (3, 5, 3)))])
 
 
@@ -48,6 +48,7 @@ def flicker_part(turn: np.ndarray) -> np.ndarray:
 def slow_parts(turn: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the spectrum (nodes,) of a noise whose white part is 1 (densities.pyx has its derivatives).
 
-    x: standard normal values, as probable as the first-order part's size and time, and the other's size."""
+    `x` (3,) has a standard normal prior: the normal scores of the first-order part's size and time constant,
+    and of the 1/f part's size."""
     size, time, flicker = np.exp(SLOW[:, 0] + (SLOW[:, 1] - SLOW[:, 0]) * ndtr(x))
     return np.asarray(1 + size**2 * first_order(time, turn) + flicker**2 * flicker_part(turn))

@@ -1,4 +1,4 @@
-"""The curvature of a log posterior at its maximum, and the deviations and bounds that it tells of."""
+"""Curvature of a log posterior at its maximum, standard deviations, and parameters at their bounds."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.plant.residuals import Problem
 
-EDGE = 1e-6  # of a parameter's range, up to which it is at its end
-MOST = 0.9  # of a curvature that not knowing the spectrum may take
+EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is at its bound
+MOST = 0.9  # largest share of the curvature that the unknown spectrum may remove
 
 
 def kept(h: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return the curvature of the unknowns `of` (k,), a mask; the others are eliminated."""
+    """Return the curvature of the unknowns that the mask `of` (k,) selects; the others are eliminated."""
     cross = h[np.ix_(~of, of)]
     absorbed = cross.T @ np.linalg.pinv(h[np.ix_(~of, ~of)], hermitian=True) @ cross
     return np.asarray(h[np.ix_(of, of)] - absorbed)
@@ -25,7 +25,7 @@ def deviations(
 ) -> dict[str, float]:
     """Return the standard deviations of the effects' parameters, in their units.
 
-    A parameter of the plant that is pressed to its bound does not give way to an effect: it is held."""
+    A parameter of the plant at its bound is held there: it cannot absorb part of an effect."""
     problem, known, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
     moves = np.array([q not in bounds or q not in known for q, _ in problem.unknowns])
     sd = np.zeros(len(moves))
@@ -48,7 +48,7 @@ def at_bound(problem: Problem, z: np.ndarray) -> dict[str, str]:
 
 
 def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
-    """matrix - relief, where no direction loses more than MOST of its curvature."""
+    """Return matrix - relief, limited so that no direction loses more than MOST of its curvature."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     w, q = np.linalg.eigh(matrix / np.outer(size, size))
     root = q * np.sqrt(np.maximum(w, 1e-12))  # matrix = size root root' size

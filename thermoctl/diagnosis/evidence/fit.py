@@ -36,12 +36,12 @@ from thermoctl.plant.simulate import SimulationError
 
 SIGNIFICANT = 2.0  # standard deviations
 UNIFORM = 12.0  # precision of a uniform prior over 0..1
-PERIODS = 15.0  # times the range that a refit gives a period that it could have had (logarithms)
+PERIODS = 15.0  # range of all possible periods over the range that a refit gives a period (logarithms)
 DECADES = 4.0  # width of the log-uniform prior of an effect's size
-WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise that the climb starts from
-SHARE = 0.01  # of an effect's size, from which the first step towards it is taken
+WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise, from which the climb starts
+SHARE = 0.01  # share of an effect's size from which the first step towards its full size is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
-MOVES = 2  # refits after the times of jumps were moved
+MOVES = 2  # largest number of refits after times of jumps were moved
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -51,7 +51,7 @@ class Fitted:
 
     hypothesis: Hypothesis
     plant: Plant
-    fit: Fit  # its Hessian is that of the parameters, with the starts eliminated
+    fit: Fit  # its Hessian is that of the parameters, with the initial states eliminated
     log_likelihood: float
     log_prior: float
     volume: float  # k/2 log 2 pi - 1/2 log |H|
@@ -59,7 +59,7 @@ class Fitted:
     powers: tuple[np.ndarray, ...]
     sd: Mapping[str, float]  # of the effects' parameters
     rough_plant: Plant
-    rough: Fit  # refit in white noise, whose free run is closest to the data: extensions start there
+    rough: Fit  # refit in white noise: its free run is closest to the data, and extensions start there
     rough_powers: tuple[np.ndarray, ...]
     curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
     past: Past  # of earlier recordings
@@ -90,12 +90,12 @@ class Fitted:
 def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
     """Return whether any, or all, amplitudes of the effect are within SIGNIFICANT sd of no effect.
 
-    For an effect without an amplitude (lag, delay): whether a parameter is at its lower bound.
-    A period at its upper bound does not repeat in the recordings: that is no periodic effect.
-    A parameter too small to be seen, at whose zero the effect is a simpler one: it is that one."""
+    An effect without an amplitude (lag, delay) is insignificant if a parameter is at its lower bound. So is a
+    periodic effect with a period at its upper bound: the period does not repeat in the recordings. So is an
+    effect with an `at_zero` parameter at its lower bound: at zero it is a simpler effect."""
     sizes = [p for p in e.candidate.effect.parameters if p.amplitude and p.name in e.own]
     if not set(e.own.values()) <= f.plant.parameters.keys():
-        return True  # another effect took its place
+        return True  # another effect replaced the equation that it changes
     effect = e.candidate.effect
     for p in effect.parameters:
         at = f.fit.at_bound.get(e.own.get(p.name, ""))
@@ -148,7 +148,8 @@ def _refitted(
 ) -> Fitted:
     """Refit a plant from one starting point; the arguments are those of `fitted`.
 
-    A refit that ends below its parent, which it contains, starts again beside the parent."""
+    A hypothesis contains its parent. A refit that ends with a lower likelihood starts again from the
+    parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
         start = refit.fit(
@@ -176,7 +177,7 @@ def _refitted(
 
 
 def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
-    """Return the unknowns at the parent's maximum, with a small share of each effect that it has not."""
+    """Return the unknowns at the parent's maximum, with a small share of each effect that it lacks."""
     problem, plant = posterior.problem, posterior.plant.parameters
     small = {
         e.own[p.name]: p.null + SHARE * (plant[e.own[p.name]].value - p.null)
@@ -197,10 +198,10 @@ def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
 def _led(posterior: Posterior, parent: float) -> np.ndarray:
     """Return the unknowns from which a refit starts: the effects at full size, if these improve the fit.
 
-    The plant's own parameters may have imitated the effect. Then its full size gives a cost above `parent`,
-    that of the refit without it. In that case one Gauss-Newton step is taken from a small share of the
-    effect. Sizes and the plant's parameters change in this step, shapes do not. Of the three points the one
-    with the least cost is the start."""
+    The plant's own parameters may have imitated the effect. Then at full size the cost is above `parent`, the
+    cost of the refit without the effect. In that case one Gauss-Newton step is taken from a small share of
+    the effect. Sizes and the plant's parameters change in this step, shapes do not. The refit starts at full
+    size, at the small share or after the step, whichever has the least cost."""
     problem = posterior.problem
     full = problem.start({})
     costs = [_cost(problem, full)]
@@ -228,9 +229,9 @@ def _cost(problem: Problem, z: np.ndarray) -> float:
 
 
 def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np.ndarray) -> np.ndarray:
-    """Return z after one Gauss-Newton step of the unknowns `free`, straight in the values of the parameters.
+    """Return z after one Gauss-Newton step of the unknowns `free`, linear in the values of the parameters.
 
-    A parameter that an effect replaces goes towards zero. Its logarithmic scale would bend that path."""
+    A parameter that an effect replaces goes towards zero. On its logarithmic scale it could not get there."""
     problem = posterior.problem
     values, _ = problem.unpack(z)
     low, high = (bound - z for bound in posterior.bounds)
@@ -254,7 +255,7 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
 
 
 def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
-    """Laplace's evidence at the maximum."""
+    """Return the fitted hypothesis at the maximum `top`, with its log evidence by Laplace's method."""
     problem, z, matrix = posterior.problem, top.spot.z, top.matrix
     average, powers, errors = top.spot.found.average, top.spot.found.powers, top.spot.found.errors
     values, dx0 = problem.unpack(z)
@@ -282,7 +283,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
         converged=top.converged,
         left=2 * top.left,
     )
-    # with hundreds of recordings the starts' part fills the memory
+    # of hundreds of recordings, the Hessian with all initial states would fill the memory
     rough = dataclasses.replace(
         rough, hessian=kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
     )
@@ -308,7 +309,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
 
 
 def remembered(case: Case, f: Fitted) -> Past:
-    """Return what all recordings so far say of a hypothesis."""
+    """Return the posterior of a hypothesis from all recordings so far."""
     shared = np.array([r is None for _, r in f.fit.unknowns], bool)
     names = tuple(q for q, r in f.fit.unknowns if r is None)
     at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
@@ -338,18 +339,18 @@ def placed_before(effects: Sequence[Placed], plant: Plant) -> tuple[PlacedBefore
 
 
 def as_refitted(case: Case, f: Fitted) -> Fitted:
-    """The hypothesis as an ordinary refit in white noise leaves it, for comparison."""
+    """Return the hypothesis at its other refit, in white noise: the free run is closest to the data there."""
     average = averaged(case.grids, f.rough_powers)
     return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
 
 
 def as_weighed(f: Fitted) -> Fitted:
-    """The hypothesis with the fit of its evidence as starting point, too: one more term is weighed there."""
+    """Return the hypothesis with the maximum of its posterior in place of the refit in white noise."""
     return dataclasses.replace(f, rough_plant=f.plant, rough=f.fit, rough_powers=f.powers)
 
 
 def with_residuals(case: Case, f: Fitted) -> Fitted:
-    """Return the fitted hypothesis with its residuals; those of long recordings were not kept."""
+    """Return the fitted hypothesis with its residuals, simulated again if they were too many to keep."""
     if f.fit.residuals:
         return f
     drives, found = case.drives(f.fit.model), f.fit
@@ -363,7 +364,7 @@ def with_residuals(case: Case, f: Fitted) -> Fitted:
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
     """Return log p(z): Gaussians, uniform shapes, and the effects' sizes with standard deviations `sd`.
 
-    The catalogue's own priors are Gaussians, too: their curvature is the precision."""
+    A prior that a catalogue entry states counts as a Gaussian whose precision is the prior's curvature."""
     values, _ = posterior.problem.unpack(z)
     stated = posterior.problem.prior_terms(values, True)[2]
     out = posterior.prior(z)
@@ -380,7 +381,9 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
 
 
 def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
-    """Return log p(D | z) + log p(z), the integrand of `log_evidence`; sizes' sd are those of `found`."""
+    """Return log p(D | z) + log p(z), the integrand of `log_evidence`.
+
+    The standard deviations of the effects' sizes are those of `found`."""
     return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
         posterior, z, found.sd
     )
@@ -389,7 +392,7 @@ def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
 def _size(p: EffectParameter, value: float, sd: float) -> float:
     """Return the log prior density of an effect's size: log-uniform over DECADES decades or its bounds.
 
-    Below its standard deviation the density is nearly constant."""
+    For sizes below the standard deviation `sd` the density is nearly constant."""
     low, high = sorted((abs(p.low - p.null), abs(p.high - p.null)))
     one_sided = p.low >= p.null or p.high <= p.null
     decades = min(DECADES, np.log10(high / low)) if one_sided and 0 < low < high < np.inf else DECADES

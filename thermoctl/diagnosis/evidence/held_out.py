@@ -1,4 +1,4 @@
-"""Score of a hypothesis on data that took no part in any choice: measured once, after all choices."""
+"""Errors of the findings on data that took no part in any choice, measured once, after all choices."""
 
 from __future__ import annotations
 
@@ -17,19 +17,22 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-ENOUGH = 3  # recordings, from which the last one is set aside
-BLOCKS = 16  # of a recording. Where recordings are too few, every other one is fitted and the rest checked
+ENOUGH = 3  # from this number of recordings on, the last one is set aside
+# Blocks of a recording; with too few recordings, every other block is fitted and the rest checked.
+BLOCKS = 16
 
 
 @dataclass(frozen=True)
 class Worth:
     """Root-mean-square errors per output of the original plant, refitted, and with the findings.
 
-    `noise`: standard deviation of each output's noise. `reserved`: on recordings set aside; otherwise
-    cross-validated, on data that took part in the choice.
-    `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
-    without such recordings. `tables`: the recordings that the errors are of; `errors`: by the keys of a
-    result's `fit`, one array (N, outputs) for each of them."""
+    - `reserved`: are they errors on recordings set aside? Otherwise they are cross-validated on the
+      recordings that took part in the choice
+    - `noise`: standard deviation of each output's noise
+    - `worse`: probability that the findings predict the recordings set aside worse than a refit alone; 0
+      without such recordings
+    - `tables`: the recordings that the errors were measured on
+    - `errors`: by the keys of a result's `fit`, one array (N, outputs) for each of these recordings"""
 
     before: dict[str, float]
     refit_only: dict[str, float]
@@ -43,7 +46,7 @@ class Worth:
 
     @property
     def share_closed(self) -> float | None:
-        """Share of the energy beyond the noise, summed over outputs, that the findings close."""
+        """Share of the energy above the noise, summed over outputs, that the findings remove."""
         before, after = (
             sum(max((rms.get(o, np.inf) / self.noise[o]) ** 2 - 1, 0.0) for o in self.refit_only)
             for rms in (self.refit_only, self.after)
@@ -52,14 +55,14 @@ class Worth:
 
 
 def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Table], list[Table]]:
-    """The recordings to choose on, and those set aside."""
+    """Return the recordings that the choice is made on, and those that are set aside."""
     if held_out or len(tables) < ENOUGH:
         return list(tables), list(held_out)
     return list(tables[:-1]), list(tables[-1:])
 
 
 def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
-    """Errors on the reserve; without one, on every other block, the plants refitted to the rest."""
+    """Measure the errors on the reserve. Without one, cross-validate: see `_crossed`."""
     noise = {o: n.sigma for o, n in zip(case.plant.outputs, case.noise, strict=True)}
     if reserve:
         if case.block > 1:
@@ -77,7 +80,7 @@ def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> W
 
 
 def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
-    """Return the probability that errors `after` are larger than those `alone`, as a mean over all time.
+    """Return the probability that the errors `after` are larger on average than the errors `alone`.
 
     Differences of squares, each over its output's sum of squares, are summed over blocks: errors are not
     independent from row to row (Diebold & Mariano 1995). The blocks' mean has Student's t distribution."""
@@ -104,7 +107,7 @@ def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
 
 
 def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
-    """Free-run errors on a recording that took no part, less what its uncertain start explains."""
+    """Return the free-run errors (N, outputs) on a recording set aside, its initial states fitted."""
     model = compile_plant(plant)
     d = model.prepare(model.excitation(table))
     try:
@@ -123,10 +126,12 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
 
 
 def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
-    """Return the errors in each recording's blocks but the first, the plant refitted to every other block."""
+    """Return the errors in each recording's blocks, each from a refit to every other block.
+
+    The first block is always fitted and has no error (NaN)."""
     measured = {o.column for o in case.plant.outputs.values()}
     errors = [np.full((len(t), len(f.fit.model.outputs)), np.nan) for t in case.tables]
-    for parity in (0, 1):  # the first block is always fitted: an effect of the start is seen only there
+    for parity in (0, 1):  # the first block is always fitted: only there an effect on the initial state shows
         train = [_masked(t, measured, parity, True) for t in case.tables]
         model = compile_plant(f.plant)
         drives = [model.excitation(t) for t in train]
@@ -136,7 +141,8 @@ def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
             )
             for r, t in enumerate(case.tables):
                 aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
-                d = dataclasses.replace(drives[r], y=aside)  # its start is that of the whole recording
+                # The initial state is that of the whole recording.
+                d = dataclasses.replace(drives[r], y=aside)
                 error = d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y
                 errors[r] = np.where(np.isfinite(aside), error, errors[r])
         except SimulationError:

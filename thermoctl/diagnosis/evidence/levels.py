@@ -12,15 +12,15 @@ from thermoctl.diagnosis.data.grids import Grid
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.limits import Thresholds
 
-PRESENT = 0.5  # probability of a remainder, from which an output's residual holds one
-RARE = 0.05  # chance of a power as small as that of an octave, below which it contradicts a noise
+PRESENT = 0.5  # probability of a remainder from which the output's noise is not estimated from its residual
+RARE = 0.05  # an octave contradicts a noise if the chance of so small a power is below this
 
 
 def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
     """Return the largest variance of a noise that the power of no octave contradicts, up to `Grid.most`.
 
-    Errors of a plant fall with frequency. Power that is there at all frequencies is noise. `absorbed`: number
-    of unknowns of a refit, which may have absorbed that many rows, all of them in one octave."""
+    Errors of a plant fall with frequency, so power at all frequencies is noise. `absorbed`: number of
+    unknowns of a refit. They may have absorbed as many DCT rows, in the worst case all of one octave."""
     power = g.power(powers) / g.shape
     octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
     rows = np.bincount(octave, g.count) - absorbed
@@ -30,14 +30,13 @@ def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
 
 
 def timing(case: Case, f: Fitted) -> list[float]:
-    """Return each output's variance beyond its stated noise at all frequencies, as far as uncertain times may
-    add it."""
+    """Return the variance above each output's stated noise, at most what uncertain times may add."""
     beyond = [floor(g, f.powers, len(f.fit.unknowns)) - g.variance for g in case.grids]
     return [float(np.clip(v, 0.0, g.timing)) for v, g in zip(beyond, case.grids, strict=True)]
 
 
 def late(case: Case, f: Fitted) -> list[str]:
-    """Return sentences about outputs that uncertain times make more wrong than the stated noise."""
+    """Return a sentence for each output whose uncertain times add more error than the stated noise."""
     out = []
     for g, v in zip(case.grids, timing(case, f), strict=True):
         if v > g.variance:
@@ -51,9 +50,9 @@ def late(case: Case, f: Fitted) -> list[str]:
 
 
 def rounded(case: Case) -> list[bool]:
-    """Return for each output whether its reading rests on the steps of its rounding.
+    """Return for each output whether it is coarsely rounded: it changes by less than a step in a sample.
 
-    Such a reading errs with the signal: a remainder there proves nothing."""
+    The error of such a reading depends on the signal, so a remainder there proves nothing."""
     drives, outputs = case.drives(case.null.model), list(case.plant.outputs.values())
     out = []
     for g in case.grids:
@@ -65,16 +64,16 @@ def rounded(case: Case) -> list[bool]:
 
 
 def remainder(case: Case, f: Fitted) -> float:
-    """Return the largest probability of a remainder at an output whose remainder proves something."""
+    """Return the largest probability of a remainder at an output that is not coarsely rounded."""
     known = zip(f.average.remainder, rounded(case), strict=True)
     return max((p for p, coarse in known if not coarse), default=0.0)
 
 
 def levels(case: Case, f: Fitted) -> list[float]:
-    """Return the standard deviation of each output's noise: learnt, where the residual holds no remainder.
+    """Return the standard deviation of each output's noise.
 
-    A stated noise may be wrong by two standard deviations of its prior either way. Beside a remainder the
-    stated noise counts, and what uncertain times add to it."""
+    Without a likely remainder it is estimated from the residual, within two standard deviations of the prior
+    of the stated noise. With one it is the stated noise, plus the variance that uncertain times add."""
     out = []
     for g, late, sensor, p in zip(
         case.grids, timing(case, f), f.average.sensor, f.average.remainder, strict=True

@@ -6,14 +6,14 @@ Bands of an output's recordings at the same frequency count as one.
     V_b = c^2 s^2 + j^2 w^2 + q exp(u_b)
     log p(R | V) = -1/2 sum_b (n_b log 2 pi V_b + P_b / V_b)
 
-s is the noise that the plant file states, c its error, log-normal. Recorded times may be off by j sampling
-intervals, log-normal. A reading that changes by w in an interval is then off by j w, at all frequencies as
-its noise is. Where slow parts are stated, s^2 follows their spectrum. q exp(u_b) is the remainder and every
-slow error of the sensor. u is a random walk over log frequency: smooth, and its size is learnt at each
-frequency. So an error of the plant at one frequency says little about another. But a plant with a large
-error is not exact at any frequency. So at least the share FLOOR of the remainder's energy lies evenly over
-all of them. Errors that nobody will name are small. So the remainder's share of the output's swing has a
-half-normal prior of width SMALL, and q = (SMALL swing)^2.
+s is the noise that the plant file states, c the factor by which it is wrong, log-normal. Recorded times may
+be off by j sampling intervals, log-normal. A reading that changes by w in an interval is then off by j w,
+with the same power at all frequencies. Where slow parts are stated, s^2 follows their spectrum. q exp(u_b) is
+the remainder and every slow error of the sensor. u is a random walk over log frequency: it is smooth, and an
+error of the plant at one frequency says little about another. But a plant with a large error is not exact at
+any frequency. So at least the share FLOOR of the remainder's energy is spread evenly over all frequencies.
+Errors that nobody will name are small. So the rms of the remainder has a half-normal prior whose width is the
+share SMALL of the output's swing: q = (SMALL swing)^2.
 
     log p(R) = log [ABSENT p(R | none) + (1 - ABSENT) p(R | remainder)]
 
@@ -38,10 +38,10 @@ from thermoctl.diagnosis.evidence.densities import NOISE, REMAINDER, SLOW, Densi
 ABSENT = 0.5  # prior of no remainder at an output
 WHITE = 0.5  # prior of no slow part in a noise whose parts nobody stated
 FLOOR = 0.1  # least share of the remainder's energy that is spread evenly over all frequencies
-# Nats of one output: up to LITTLE a predicted rise is taken to first order (rms error 0.02). Up to NEAR the
-# known maxima are the start.
+# Change of one output's log likelihood, nats. Below LITTLE its first-order value is used (rms error 0.02).
+# Below NEAR the maxima are searched again from the known ones.
 LITTLE, NEAR = 1.0, 5.0
-LEAST = 1e-6  # of the stated noise's variance: a residual of zero has no logarithm
+LEAST = 1e-6  # least power, over the stated noise's: a residual of zero has no logarithm
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -63,9 +63,9 @@ class Averaged:
 
 @dataclass(frozen=True)
 class _Output:
-    """The same of one output; `inverse` (nodes,): E[1/V] at each of its frequencies.
+    """`Averaged` of one output. `inverse` (nodes,): E[1/V] at each of its frequencies.
 
-    `at`: x at the maximum of each density."""
+    `at`: the variables x at the maximum of each density (densities.pyx)."""
 
     log_likelihood: float
     inverse: np.ndarray
@@ -100,21 +100,21 @@ def _by_channel(
 
 
 class Around:
-    """Other powers beside known ones: by how much their log likelihood is above, and their weights.
+    """The log likelihood of other powers, as a rise above that of known powers, and their weights.
 
-    d log p / dP = -E[1/V] / 2. Where that makes less than LITTLE, the output is not averaged again; less than
-    NEAR, the maxima are looked for from the known ones."""
+    To first order the rise of an output is -E[1/V] / 2 times the change of its power. If this is below
+    LITTLE, it is used. If it is below NEAR, the maxima are searched from the known ones."""
 
     def __init__(self, grids: Sequence[Grid], powers: Sequence[np.ndarray]):
         self.grids = grids
         self.known = [(g, p := g.power(powers), _output(g, p)) for g in grids]
 
     def rise(self, others: Sequence[np.ndarray]) -> float:
-        """Return by how much the log likelihood is above that of the known powers."""
+        """Return the log likelihood of other powers minus that of the known powers."""
         return sum(rise for rise, _ in self._each(others))
 
     def weighed(self, others: Sequence[np.ndarray]) -> tuple[float, list[np.ndarray]]:
-        """Return this, and E[1/V] in the bands of each channel."""
+        """Return the rise, and E[1/V] in the bands of each channel."""
         found = list(self._each(others))
         return sum(rise for rise, _ in found), _by_channel(self.grids, [v for _, v in found], others)
 
@@ -134,7 +134,9 @@ class Around:
 def _output(
     g: Grid, power: np.ndarray, near: Sequence[np.ndarray] | None = None, unsure: bool = False
 ) -> _Output:
-    """Average the likelihood of an output's power at each frequency (nodes,). `near`: x to start from."""
+    """Average the likelihood of one output over noise and remainder.
+
+    `power` (nodes,): at each frequency. `near`: by density, the x from which its maximum is searched."""
     power = np.maximum(power, LEAST * g.variance * g.count)
     kinds = (NOISE, REMAINDER) if g.sensor else (NOISE, SLOW, REMAINDER)
     densities = [density(g, kind) for kind in kinds]
@@ -191,6 +193,6 @@ def log_p(g: Grid, kind: int, at: Spot, root: np.ndarray) -> float:
 
 
 def _unsure(at: Spot, root: np.ndarray) -> np.ndarray:
-    """Return the covariance of 1/V."""
+    """Return the covariance (nodes, nodes) of 1/V under one density, to first order."""
     moves = solve_triangular(root, (at.slope / at.variance[:, None]).T, lower=True)
     return np.asarray(moves.T @ moves)

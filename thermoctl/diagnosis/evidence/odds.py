@@ -25,7 +25,7 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thres
 
 
 def rare(effect: Effect, of_input: bool) -> int:
-    """Return how many times an effect is rare beside constant physics.
+    """Return by how many factors `rare` an effect is less likely than constant physics.
 
-    Once where it depends on the time itself, once where it is a fault of a recorded input."""
+    One if it depends on the time itself, and one more if it is a fault of a recorded input."""
     return effect.timed + (of_input and effect.where != "drive")

@@ -1,4 +1,4 @@
-"""The times of jumps, moved to where they fit best: a refit cannot, since a jump has no slope to follow."""
+"""Move the times of jumps to where they fit best. A refit cannot: a jump has no derivative by its time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from thermoctl.plant.simulate import SimulationError
 TIMES = ("onset", "start", "end")  # shapes that are the time of a jump
 ONSETS = 24  # onset times of a screening's grid over the recordings
 FINER = 4  # factor from one grid to the next
-GAIN = 2.0  # of the squared errors over the noise, from which a time is moved: one nat
+GAIN = 2.0  # least decrease of the squared errors over the noise to move a time: one nat
 
 
 def moved(case: Case, plant: Plant, effects: Sequence[Placed], found: Fit) -> Plant | None:
-    """Return a refitted plant with the times of its jumps moved, all else as it is; None if none fits better.
+    """Return the plant with better times of its jumps and no other change; None if no other times fit better.
 
-    Each time is looked for on grids about it, from the screening's to half a sample."""
+    Each time is searched on finer and finer grids about it, from the screening's step to half a sample."""
     own = {e.own.get(p.name) for e in effects for p in e.candidate.effect.parameters if p.shape in TIMES}
     times = {q: k for k, (q, r) in enumerate(found.unknowns) if q in own and r is None}
     if not times:

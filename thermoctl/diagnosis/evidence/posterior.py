@@ -2,9 +2,9 @@
 
     log p(z | D) = log p(D | z) + log p(z) + constant
 
-log p(D | z) is averaged over noise and remainder (noise.py). Its maximum is climbed by plant/climb.py; with
-the weights E[1/V] the gradient is exact. Gradient and curvature are sums over recordings:
-one recording at a time is simulated, and its sums are added.
+log p(D | z) is averaged over noise and remainder (noise.py). plant/climb.py finds its maximum; with the
+weights E[1/V] the gradient is exact. Gradient and curvature are sums over recordings: one recording at a time
+is simulated, and its sums are added.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 
 BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 ROUNDS = 40  # largest number of steps
-FAR = 8.0  # standard deviations that a start may be off
-ENOUGH = 0.05  # of the log posterior, promised by a step, below which none is taken
+FAR = 8.0  # bound of an initial state, in standard deviations of its prior
+ENOUGH = 0.05  # nats: the climb ends when a step promises a smaller rise of the log posterior
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Placed:
     """An effect at a place, and the parameters that it adds to the plant."""
 
     candidate: Candidate
-    own: Mapping[str, str]  # its parameter: the plant's name
+    own: Mapping[str, str]  # by parameter of the effect, its name in the plant
 
     @property
     def key(self) -> tuple[str, str]:
@@ -52,17 +52,17 @@ class Hypothesis:
 
     @property
     def keys(self) -> frozenset[tuple[str, str]]:
-        """The (effect, where) of each."""
+        """The key (effect, place) of each effect."""
         return frozenset(e.key for e in self.effects)
 
 
-# z, and each recording's unknowns and its channels' slopes (rows, k) there
+# z; and for each recording its unknowns (k,) and its channels' slopes (rows, k) at z
 Slopes = tuple[np.ndarray, list[tuple[np.ndarray, list[np.ndarray]]]]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The free-run errors at a point, their rows, likelihood and powers; slopes where they are kept."""
+    """A point: free-run errors, their DCT rows, likelihood and powers, and slopes if they were computed."""
 
     errors: list[np.ndarray]
     rows: list[np.ndarray]
@@ -76,7 +76,7 @@ class Sums:
     """One recording's share of gradient and curvature of the log likelihood, by its unknowns (k,).
 
     - `gradient` (k,), `matrix` (k, k): J' E[1/V] R and J' E[1/V] J
-    - `by_band`: of each channel J' R in each band (bands, k)"""
+    - `by_band`: for each channel, J' R in each band (bands, k)"""
 
     unknowns: np.ndarray
     gradient: np.ndarray
@@ -124,11 +124,11 @@ def _simulated_sums(
     rows: Sequence[np.ndarray],
     inverse: Sequence[np.ndarray],
 ) -> Sums:
-    """Return a recording's sums; its slopes are computed, and forgotten."""
+    """Return a recording's sums. Its slopes are computed and not kept."""
     run = problem.model.run(problem.excitations[r], values, dx0, sensitivities=True, states=False)
     used, unknowns, slope = problem.slopes(r, values)
     assert run.dy is not None
-    dy = run.dy  # of one channel at a time copies are made: a recording has megabytes
+    dy = run.dy  # copied one channel at a time: a recording has megabytes
     slopes = (transform(c, dy[:, c.output, used]) * slope for c in channels)
     return _sums(channels, unknowns, slopes, rows, inverse)
 
@@ -161,16 +161,16 @@ class Posterior:
         self.newest: tuple[np.ndarray, Sequence[Sums]] | None = None
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(N, outputs, ...) of each recording as rows of each channel."""
+        """Transform samples (N, outputs, ...) of each recording to DCT rows (rows, ...) of each channel."""
         return [transform(c, e[c.recording][:, c.output]) for c in self.case.coordinates.channels]
 
     def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
-        """The averaged likelihood of residuals' rows, and their powers."""
+        """Return the averaged likelihood of the residuals' DCT rows, and their powers by band."""
         powers = self.case.coordinates.powers(rows)
         return averaged(self.case.grids, powers), powers
 
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
-        """Free-run errors. Raises SimulationError."""
+        """Return the free-run errors at z (N, outputs) by recording. Raises SimulationError."""
         return self._checked(self.problem.each(Problem.errors, self.problem.unpack(z), lambda r: (), 1))
 
     def _checked(self, errors: list[np.ndarray]) -> list[np.ndarray]:
@@ -180,7 +180,7 @@ class Posterior:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Between which the unknowns lie."""
+        """Lower and upper bounds (k,) of the unknowns."""
         n, m = self.problem.n_parameters, len(self.problem.unknowns)
         return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
             [np.ones(n), np.full(m - n, FAR)]
@@ -197,9 +197,9 @@ class Posterior:
         )
 
     def errors_and_slopes(self, z: np.ndarray) -> list[np.ndarray]:
-        """Free-run errors; slopes are kept for `sums`, if they are not too many. Raises SimulationError.
+        """Return the free-run errors, and keep the slopes for `sums` if they are not too many.
 
-        One run costs less than two."""
+        One run for both costs less than two. Raises SimulationError."""
         if not self.problem.keeps:
             return self.errors(z)
         parts = self.problem.each(_slopes, self.problem.unpack(z), lambda r: (self.channels[r],), 2)
@@ -210,7 +210,7 @@ class Posterior:
     def sums(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
     ) -> Sequence[Sums]:
-        """Return what each recording adds to gradient and curvature.
+        """Return each recording's share of gradient and curvature.
 
         `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel."""
         data, at = [], 0
@@ -229,7 +229,7 @@ class Posterior:
     def slope(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient of the log posterior, and minus its second derivative."""
+        """Return the gradient (k,) of the log posterior at z, and minus its second derivative (k, k)."""
         n = len(z)
         gradient, matrix = np.zeros(n), np.zeros((n, n))
         self.newest = z.copy(), self.sums(z, rows, inverse)
@@ -241,7 +241,7 @@ class Posterior:
         return gradient - self.precision @ (z - self.mean) - push, matrix + self.precision + bend
 
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
-        """Return E[1/V] J'J minus the curvature: the gradient's variance over the unknown V (Louis 1982)."""
+        """Return the curvature that is lost because V is not known: the gradient's variance (Louis 1982)."""
         out = np.zeros((len(z), len(z)))
         if self.newest is None or not np.array_equal(self.newest[0], z):
             self.slope(z, rows, average.inverse)
@@ -260,11 +260,11 @@ class Posterior:
 
     @property
     def few(self) -> bool:
-        """Should a trial step compute slopes at once?"""
+        """Are there so few unknowns that a trial step should compute slopes at once?"""
         return self.problem.few
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[Seen]:
-        """The log posterior at z."""
+        """Return the point z with its log posterior, and with slopes if asked for."""
         kept = self.kept
         errors = self.errors_and_slopes(z) if slopes else self.errors(z)
         slopes_here, self.kept = self.kept if slopes else None, kept
@@ -280,7 +280,9 @@ class Posterior:
         return self.slope(spot.z, spot.found.rows, spot.found.average.inverse)
 
     def bend(self, spot: Spot[Seen], step: np.ndarray) -> np.ndarray:
-        """Weighed by E[1/V] of the spot. Zeros where the recordings are too many to keep their slopes."""
+        """Return the second-order change of the residuals along a step, projected on their slopes (k,).
+
+        The weights are E[1/V] of the spot. Zeros if slopes are too many to keep."""
         out = np.zeros_like(step)
         if self.kept is None:
             return out
@@ -301,9 +303,9 @@ class Posterior:
 def _priors(
     case: Case, problem: Problem, effects: Sequence[Placed]
 ) -> tuple[dict[int, tuple[Candidate, EffectParameter]], np.ndarray, np.ndarray]:
-    """Return which unknowns are sizes of effects, and every unknown's prior mean and precision as a Gaussian.
+    """Return the unknowns that are sizes of effects, and the mean and precision of every Gaussian prior.
 
-    A delay is a size, too."""
+    The delay of an effect is a size, too."""
     mean, precision = problem.z_plant.copy(), np.ones(len(problem.unknowns))
     own = {
         e.own[p.name]: (e.candidate, p)
@@ -326,7 +328,7 @@ def _priors(
 
 
 def gaussian(posterior: Posterior) -> np.ndarray:
-    """The unknowns whose prior is a Gaussian (those of effects have their own until recordings were seen)."""
+    """Return the unknowns with a Gaussian prior: the plant's, and those that earlier recordings have."""
     names = {n for e in posterior.effects for n in e.own.values()}
     return np.array(
         [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],

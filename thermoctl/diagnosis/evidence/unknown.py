@@ -1,4 +1,4 @@
-"""The remainder that no entry explains: its size in the sensors' units, its node, the signals it follows."""
+"""The remainder of a hypothesis: its size in the sensors' units, its node, signals that correlate with it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thermoctl.diagnosis.evidence.levels import levels, over_noise
 from thermoctl.diagnosis.evidence.where import Responses, responses, signals
 from thermoctl.diagnosis.hypothesis.roles import Structure
 
-CORRELATED, SHOWN = 0.4, 3  # least correlation of a signal that is reported; largest number reported
+CORRELATED, SHOWN = 0.4, 3  # reported signals: least correlation with the residual; largest number
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ def left(case: Case, f: Fitted, reach: Responses) -> Left:
 
 
 def reached(case: Case) -> Responses:
-    """How random forces at the nodes of the plant, refitted as it came, reach its outputs."""
+    """Return how random forces at the nodes of the refitted original plant change its outputs."""
     model = case.null.model
     rates = set(Structure(case.plant, [], []).pairs.values())  # positions store nothing
     return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
 
 
 def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
-    """Return the nodes, that whose random forces explain the residuals best first."""
+    """Return the nodes, sorted by how well random forces there explain the residuals, the best first."""
     scores = {}
     for i, node in enumerate(reach.nodes):
         by_cell = np.zeros(len(reach.share))
@@ -67,7 +67,7 @@ def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
 def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
     """Return signals, or their changes, whose correlation with an output's residual is CORRELATED or more.
 
-    The strongest is first; at most SHOWN."""
+    The strongest is first; there are at most SHOWN."""
     model, j = f.fit.model, f.fit.model.outputs.index(output)
     found: dict[str, list[tuple[float, float, float]]] = {}
     for r, d in enumerate(case.drives(model)):

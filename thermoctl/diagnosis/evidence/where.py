@@ -1,9 +1,9 @@
 """Where a remainder enters: the node at which small random forces would explain it best.
 
 A white force at node i, with the rms of its typical flow, gives output j the variance F_ij(b) in band b.
-F is measured on the plant, linearised along its own trajectory (`Model.respond`). A few forces are enough:
-each contains some bands of the DCT. A slow force is a first-order process with time constant tau. Its rms is
-the share eta of the typical flow:
+F is computed by simulating the plant linearised along its own trajectory (`Model.respond`). FORCES forces a
+node are enough, because each contains some bands of the DCT. A slow force is a first-order process with time
+constant tau. Its rms is the share eta of the typical flow:
 
     V_j(b) = c^2 s^2 + eta^2 F_ij(b) S_b(tau)
 """
@@ -23,8 +23,8 @@ from thermoctl.plant.language import Flow, Plant
 from thermoctl.plant.simulate import Excitation, Model
 
 SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
-CORNERS = 3  # tau, from a fortieth to a quarter of the longest recording
-FORCES = 2  # a node; each holds every second band, so that neighbours' responses do not mix
+CORNERS = 3  # number of values of tau, from a fortieth to a quarter of the longest recording
+FORCES = 2  # forces a node; each holds every second band, so that responses of adjacent bands do not mix
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class Responses:
     def cells(
         self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], node: int
     ) -> list[np.ndarray]:
-        """(cells, bands) of each output, whose channels are given, of one node's forces."""
+        """Return the variances (cells, bands) by output that forces at one node cause.
+
+        `outputs`: for each output, the positions of its channels."""
         return [
             np.concatenate([self._channel(coordinates, k, node) for k in positions], axis=1)
             for positions in outputs
@@ -56,7 +58,7 @@ class Responses:
 def typical_flow(plant: Plant, node: str, values: Sequence[Mapping[str, np.ndarray | float]]) -> float:
     """Return the geometric mean of the rms flows at a node, over all recordings.
 
-    Not the largest: a large force that only stores and returns energy says little about a missing one."""
+    The largest flow would be misleading: it may be a large force that only stores and returns energy."""
     rates = [typical_rate(f, values) for f in plant.flows.values() if node in (f.source, f.target)]
     logs = [np.log(r) for r in rates if r > 0]
     return float(np.exp(np.mean(logs))) if logs else 0.0
@@ -69,7 +71,7 @@ def typical_rate(f: Flow, values: Sequence[Mapping[str, np.ndarray | float]]) ->
 
 
 def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
-    """Every name of the plant along a trajectory."""
+    """Return every name of the plant with its value or its values (N,) along a trajectory."""
     return {
         **dict(zip(model.plant.inputs, d.u.T, strict=False)),
         **dict(zip(model.parameters, map(float, values), strict=True)),

@@ -1,1 +1,1 @@
-"""The search for hypotheses: a score test of all entries at all places, and a beam that grows by refits."""
+"""The search for hypotheses: a score test of all entries at all places, and a beam search by refits."""

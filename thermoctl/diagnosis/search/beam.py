@@ -33,9 +33,10 @@ from thermoctl.yamlfile import InputError
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
-SURPLUS = 5.0  # nats over every other extension, from which one with an insignificant part is kept
-BEATEN = 10.0  # nats below the best: such a parent is not extended where the best leaves no more than noise
-# Share of hypotheses near the best that are extended. If the best cannot be extended, the others are not.
+SURPLUS = 5.0  # nats by which an extension with an insignificant part must be above all others to be kept
+# Nats below the best: a hypothesis so far below is not extended if the residual of the best is only noise.
+BEATEN = 10.0
+# Share of the hypotheses near the best that will be extended, for the time left that the progress states.
 CLOSE = 0.5
 Keys = frozenset[Key]
 Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their promised gain
@@ -92,7 +93,7 @@ class Search:
         return max(self.tried.values(), key=lambda w: w.score)
 
     def keep(self, found: Iterable[Weighed]) -> None:
-        """Add hypotheses; of two refits of one the likelier stays."""
+        """Add hypotheses. Of two refits of the same hypothesis the likelier one stays."""
         for w in found:
             keys = w.fitted.hypothesis.keys
             if keys not in self.tried or w.score > self.tried[keys].score:
@@ -184,8 +185,8 @@ def grow(s: Search) -> None:
 def swap(s: Search) -> None:
     """Leave out each effect of the best hypothesis in turn, and extend the rest, until none replaces it.
 
-    So each effect meets its rivals beside the same others, whichever way the beam took. The rest itself is
-    refitted without regard to the budget: misfit.py compares the effect with it."""
+    So each effect is compared with its rivals beside the same other effects, in whatever order the beam added
+    them. The rest is refitted even if the budget is spent: misfit.py compares the effect with it."""
     while True:
         best = s.best
         effects = best.fitted.hypothesis.effects
@@ -285,7 +286,7 @@ def _following(s: Search, plant: Plant) -> Search:
 
 
 def recall(s: Search) -> None:
-    """Refit the hypotheses of an earlier diagnosis to these recordings, from where they were."""
+    """Refit the hypotheses of an earlier diagnosis to these recordings, from their earlier values."""
     past = s.case.memory.hypotheses
     likeliest = max((h.log_evidence for h in past), default=0.0)
     for h in past:
@@ -298,9 +299,9 @@ def recall(s: Search) -> None:
 
 
 def leaders(tried: Sequence[Weighed], limits: Thresholds) -> list[Weighed]:
-    """Return the beam: hypotheses in turn by score and by free-run error.
+    """Return the beam: the best hypotheses by score and by free-run error, in turn.
 
-    By error too: the remainder may absorb an effect that a later extension explains."""
+    The error counts, too, because the remainder may absorb an effect that a later extension explains."""
     ranked = [sorted(tried, key=lambda w: -w.score), sorted(tried, key=lambda w: w.fitted.rough.cost)]
     out: dict[Keys, Weighed] = {}
     for pair in zip(*ranked, strict=True):
@@ -313,12 +314,12 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
     A promise is the first-order gain. An extension that would not reach the leader with twice its promise is
-    left out. All promises are taken for too small by the largest `ratio` so far. Beside a leader that leaves
-    no more than noise only promises count."""
+    left out. Every promise is multiplied by the largest ratio so far of a refit's gain to its promise. If the
+    residual of the leader is only noise, extensions without a finite promise are left out, too."""
     case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
-    quiet: dict[Keys, bool] = {}  # does a leader leave no more than noise?
+    quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
     queue, planned, ratio = shortlist(looked, where, limits), case.budget.later, 1.0
 
     def wanted(item: Extension) -> bool:
@@ -367,7 +368,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
 def _expected(
     case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Thresholds, untried: float
 ) -> float:
-    """Return how many hypotheses the search will probably extend besides; it steers nothing.
+    """Estimate how many more hypotheses the search will extend, for the time left that the progress states.
 
     `untried`: share of the shortlist."""
     if not any(w.fitted.hypothesis.effects for w in tried):
@@ -381,7 +382,7 @@ def _expected(
 def _abreast(
     case: Case, parent: Weighed, looked: Screened, batch: Sequence[Extension], leader: Fitted
 ) -> list[list[Fitted]]:
-    """Return the refits of each of some extensions, which run side by side."""
+    """Refit a batch of extensions in parallel; return the refits of each."""
     starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
     return each(lambda first: _followed(case, parent, looked, first, leader), starts, len(batch) * LEAST)
 
@@ -412,7 +413,7 @@ def _refitted(
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
             inputs = plant.inputs.keys()
             plant, own = extend(plant, d, drives)
-            if not own:  # an effect before took its place, and it changes nothing
+            if not own:  # an earlier effect replaced the place it acts on, so that it would change nothing
                 return None
             if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
                 drives = case.drives(compile_plant(plant))

@@ -11,13 +11,13 @@ from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import Excitation
 
-# Factor by which dry friction of a refit may creep more slowly than in the screening. A second refit starts
-# there: an axis that sticks rests for long.
+# Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor. A
+# second refit starts there, because an axis that sticks rests for a long time.
 STICKING = 300.0
 
 
 def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
-    """Return the ranges of the effect's parameters in a refit: physics' bounds, wide about the estimate."""
+    """Return the ranges of the effect's parameters in a refit: wide about the estimate, in their bounds."""
     out = {}
     for p in direction.candidate.effect.parameters:
         value = direction.start[p.name]
@@ -64,7 +64,7 @@ def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, f
 
 
 def weaker(direction: Direction, share: float = 0.1) -> Direction:
-    """Return the direction with a start at a `share` of its size."""
+    """Return the direction with a refit that starts at a `share` of its size."""
     effect, start = direction.candidate.effect, dict(direction.start)
     for p in effect.parameters:
         if p.fades(effect.shapes):
@@ -73,9 +73,9 @@ def weaker(direction: Direction, share: float = 0.1) -> Direction:
 
 
 def sticking(direction: Direction) -> Direction | None:
-    """Return the direction with a start at dry friction that sticks; None for an effect without creep.
+    """Return the direction with a start at friction that sticks; None for an effect without creep.
 
-    A refit does not find such friction from a faster creep."""
+    A refit that starts at a faster creep does not find such friction."""
     effect = direction.candidate.effect
     start = {
         p.name: direction.start[p.name] / STICKING

@@ -16,9 +16,9 @@ from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.plant import expression as ex
 
-PLACES_EACH = 3  # of an effect in a shortlist: one with many places leaves room for others
-DECADES = 3.0  # up and down from one unit: where quotients of amplitudes are looked for
-NEAR = 4.0  # factor about the screened lag or delay within which the outputs change in proportion
+PLACES_EACH = 3  # largest number of places of one effect in a shortlist, so that other effects have room
+DECADES = 3.0  # range in which the first amplitude is searched, either way from the size of the others
+NEAR = 4.0  # within this factor of the screened lag or delay the outputs change in proportion to it
 
 
 @dataclass
@@ -31,12 +31,12 @@ class Direction:
     dims: int
     start: dict[str, float]
     vector: np.ndarray | None = None  # unit vector of the projected direction
-    excited: float = 0.0  # share of the direction that the plant's own parameters leave
-    elsewhere: float = 0.0  # log10 of how many shapes this one was picked from by the residual itself
+    excited: float = 0.0  # norm of the direction after projection, over its norm before
+    elsewhere: float = 0.0  # log10 of the number of shapes from which the residual itself picked this one
 
     @property
     def log_p(self) -> float:
-        """log10 of the chance of such a gain where nothing is missing."""
+        """log10 of the probability of such a gain if nothing is missing."""
         return log_p(self.gain, self.dims) + self.elsewhere
 
 
@@ -62,7 +62,7 @@ def foremost(directions: Iterable[Direction], places: int) -> list[Direction]:
 
 
 def log_p(gain: float, dims: int) -> float:
-    """log10 of the chi-square tail, also where that is too small for a float."""
+    """Return log10 of the chi-square tail probability, also where that is too small for a float."""
     return float(_log_p(np.asarray(gain), dims))
 
 
@@ -76,9 +76,10 @@ def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Column:
-    """A direction to be built: an effect at one shape, along one of its amplitudes.
+    """The recipe of a direction: an effect at one shape, along one direction of its amplitudes.
 
-    item = (candidate, group, (shape, dim), columns in the group); `scale`: over the amplitude in `values`."""
+    item = (candidate, group, (shape, dim), number of columns in the group). `values`: the plant's parameters
+    with a small amplitude; `scale`: the factor from the change at this amplitude to that at amplitude 1."""
 
     item: tuple[Any, ...]
     overlay: Callable[[], Overlay]
@@ -102,7 +103,7 @@ def _finite(v: np.ndarray) -> np.ndarray:
 
 
 def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
-    """The effect's parameters at amplitudes s and a shape."""
+    """Return the values of the effect's parameters at amplitudes s and a shape."""
     known = {
         "s": s[0] if len(s) else 0.0,
         **{f"s{k + 1}": v for k, v in enumerate(s) if k},
@@ -126,8 +127,9 @@ def score(
 ) -> None:
     """Score the columns of one group, and keep their best direction if it is the candidate's best so far.
 
-    - `rows` (rows, k): projected; only their products count, so sketched ones will do
-    - `g` (k,): products with the residual; `full` (k,): norms of the whole rows"""
+    - `rows` (rows, k): the columns after projection, or sketches with about the same inner products
+    - `g` (k,): products of the columns with the residual; `full` (k,): norms of the columns before
+      projection"""
     c, m = columns[0].item[0], rows.T @ rows
     if "windows" in c.effect.shapes.values():
         _score_windows(c, columns, rows, full, g, m, best)
@@ -163,10 +165,10 @@ def score(
 def _plausible(
     c: Candidate, columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
-    """Return coefficients whose amplitudes are likely by the catalogue's prior, and fit as well as may be.
+    """Return the coefficients with the best sum of fit and log prior of the entry.
 
-    The other amplitudes are products with the first. Where the plant absorbs that one alone, the data leave
-    its size and its sign open, and only the prior of the others tells it."""
+    The other amplitudes are products with the first one. If the plant's parameters absorb the first one, the
+    data do not determine its size and sign. Then the prior of the other amplitudes determines them."""
     shape, _ = columns[0].item[2]
     dims = np.array([q.item[2][1] for q in columns])  # (columns, amplitudes)
     step = covariance @ dims[:, 0]
@@ -177,11 +179,11 @@ def _plausible(
     known = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
 
     def at(log_size: float) -> np.ndarray:
-        """Return the coefficients (columns,) at a size of the first one."""
+        """Return the best coefficients (columns,) at a given log size of the first amplitude."""
         return np.asarray(coefficient + step * (np.exp(log_size) - size) / variance)
 
     def surprise(log_size: float) -> float:
-        """Return -2 log of how likely the amplitudes are at a size, up to a constant."""
+        """Return -2 (log likelihood + log prior) at a log size of the first amplitude, up to a constant."""
         sizes = dims.T @ at(log_size)
         values = {**parameter_values(c, shape, list(sizes)), **known}
         unlikely = float(ex.evaluate(prior, values)) + 2 * (len(sizes) - 1) * log_size
@@ -192,21 +194,22 @@ def _plausible(
 
 
 def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
-    """Return whether the catalogue allows the size of a direction that has only one."""
+    """Return whether the catalogue allows the size of a candidate that has only one column."""
     amplitudes = [p for p in c.effect.parameters if p.amplitude]
     shape, _ = column.item[2]
     if amplitudes:
         return _allowed(amplitudes[0], coefficient)
     if "tau" in shape and (column.item[1] != (0,) or (c.jumps and not c.variant)):
-        # in proportion only from one lag of the grid to the next
+        # the change is in proportion to the lag only between neighbours of the grid
         return 1 / NEAR < coefficient < NEAR
     return coefficient > 0
 
 
 def _within(c: Candidate, column: Column, coefficient: float) -> float:
-    """Return the coefficient of a direction that has only one, inside the bounds of its amplitude.
+    """Return the coefficient of a candidate with only one column, clipped to the bounds of its amplitude.
 
-    One of the wrong sign stays as it is: beside another effect the sign may turn (shortlist.pairs)."""
+    A coefficient of the wrong sign is not clipped: beside another effect the sign may turn
+    (shortlist.pairs)."""
     p = next((p for p in c.effect.parameters if p.amplitude), None)
     if p is None:
         return coefficient
@@ -239,7 +242,7 @@ def _score_windows(
     m: np.ndarray,
     best: dict[int, Direction],
 ) -> None:
-    """Keep the best pair of a start and an end; an end beyond the last column is that of the recording."""
+    """Keep the best pair of a start and an end. An end after the last column is the end of the recording."""
     edges = [q.item[2][0]["start"] for q in columns]
     last, floor = len(edges), 1e-12 * float(full.max()) ** 2
     gain, at = -1.0, (0, 0, 0.0)

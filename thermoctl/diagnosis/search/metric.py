@@ -1,8 +1,9 @@
 """Whitened rows of a refitted hypothesis, and the part of them that its own unknowns absorb.
 
 Unknowns with a Gaussian prior of covariance P and sensitivities J add J P J' to the rows' covariance. Let
-J sqrt(P) be U s W'. The covariance's inverse root takes 1 - 1 / sqrt(1 + s^2) off each direction of U. That
-is nearly all where the data determine the unknowns, and little where the prior does."""
+J sqrt(P) be U s W'. Multiplying by the inverse root of that covariance removes the share
+1 - 1 / sqrt(1 + s^2) of each direction of U. That is nearly all where the data determine the unknowns, and
+little where the prior does. Below, this is called the projection."""
 
 from __future__ import annotations
 
@@ -17,9 +18,10 @@ from thermoctl.plant.simulate import Excitation, Model, Simulation
 
 @dataclass(frozen=True)
 class Pushed:
-    """First-order changes by columns in one recording: forces (`Model.respond`), and changes of outputs.
+    """First-order changes that columns cause in one recording.
 
-    `forces`: (state, column), with values q (N, forces); `read`: (output, column), with values (N,)."""
+    - `forces`: (state, column) of each change of a slope dx/dt, with values q (N, forces) (`Model.respond`)
+    - `read`: (output, column) of each direct change of an output, with values (N,)"""
 
     forces: list[tuple[int, int]]
     q: np.ndarray
@@ -29,10 +31,10 @@ class Pushed:
 class Metric:
     """Whitened rows of a refitted hypothesis, as the screening needs them; a subclass fills them.
 
-    - `weight` (rows,): factor of each row that whitens it
-    - `residual` (rows,): with starts at their priors' means, without what the plant's own unknowns absorb
-    - `own`: the directions that the own unknowns of each recording absorb
-    - `shared`: those that the other parameters absorb besides"""
+    - `weight` (rows,): the factor that whitens each row
+    - `residual` (rows,): after projection, with initial states at the means of their priors
+    - `own`: by recording, the directions that its own unknowns absorb (its initial states)
+    - `shared`: the further directions that the unknowns common to all recordings absorb"""
 
     fit: Fit
     model: Model
@@ -50,7 +52,7 @@ class Metric:
     def responses(self, pushed: Callable[[int], Pushed], count: int) -> np.ndarray:
         """Return the rows (rows, count), not whitened, of the responses in all recordings.
 
-        `pushed`: of a recording."""
+        `pushed`: returns the first-order changes in recording r. `count`: number of columns."""
         raise NotImplementedError
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
@@ -62,7 +64,7 @@ class Metric:
         return self.shared.without(without(self.own, d))
 
     def pulled(self, w: np.ndarray) -> np.ndarray:
-        """Return rows (rows, ...) whose products with directions are those of w with projected ones."""
+        """Return the transpose of `project`, applied to rows w (rows, ...): w' project(d) = pulled(w)' d."""
         return without(self.own, self.shared.without(w))
 
 
@@ -87,6 +89,6 @@ class Absorbed:
 
 
 def without(own: Sequence[Absorbed], d: np.ndarray) -> np.ndarray:
-    """Return rows (rows, ...) of all recordings without what each one's unknowns absorb."""
+    """Return rows (rows, ...) of all recordings without the part that each one's own unknowns absorb."""
     parts = np.split(d, np.cumsum([len(q.directions) for q in own])[:-1])
     return np.concatenate([q.without(x) for q, x in zip(own, parts, strict=True)])

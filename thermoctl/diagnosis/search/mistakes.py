@@ -2,9 +2,9 @@
 
 A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
 mass. The entries of config/mistakes/ free one such number each. They are refitted and weighed like the
-hypotheses of the search. A refit starts at the best decade: a storage that is far too small acts like
-none, so the factor has no slope at 1. A reading whose first sample contradicts the plant's start may be off
-by a constant.
+hypotheses of the search. A refit starts at the best power of ten, because a storage that is far too small has
+no gradient at the factor 1. A reading whose first sample contradicts the plant's
+initial state may be off by a constant.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from thermoctl.plant.simulate import SimulationError, compile_plant
 from thermoctl.shipped import shipped
 
 MISTAKES = shipped("config/mistakes")
-WIDE = 10.0  # range of a constant, in differences between the first sample and the plant's start
-DECADES = tuple(10.0**k for k in range(-6, 7))  # a slip of a digit up to one of two prefixes
+# Range of the constant, over the difference between the first sample and the plant's initial value.
+WIDE = 10.0
+DECADES = tuple(10.0**k for k in range(-6, 7))  # from a wrong digit to an error of two SI prefixes
 
 
 def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
-    """Return the refits with one factor each that is significant; of more than `most` places the best ones.
+    """Return the refits of the plant with one significant factor each, of at most `most` factors.
 
     `null`: the refit of the plant without any effect."""
     entries = catalogue((MISTAKES,))
@@ -44,7 +45,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
     best = sorted((min(s, key=lambda x: x[0]) for s in starts.values()), key=lambda x: x[0])
 
     def refitted(start: tuple[float, Plant, Placed]) -> Fitted | None:
-        """Return the refit from a start; None where it fails or the search was stopped."""
+        """Return the refit from a starting point; None where it fails or the search was stopped."""
         _, plant, placed = start
         try:
             return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null)
@@ -57,7 +58,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
 
 
 def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
-    """Return (least cost, the plant with the number at the best of some values, the number)."""
+    """Return (least cost of the trial values, the plant with the best one, the factor as placed)."""
     (p,) = c.effect.parameters
     off = case.off.get(c.place.output or "")
     tried = DECADES if off is None else (off,)

@@ -1,10 +1,10 @@
-"""A plant that follows its recording, for rigs whose free run forgets where it started.
+"""A plant with an observer that follows its recording, for rigs whose free run drifts away.
 
     dx/dt = f(x, u, p) + K (y_recorded - g(x)),     K = P C' R^-1 of the stationary Kalman-Bucy filter
 
-An axis integrates every error. So the free run of a plant that lacks physics is far off after a while, and
-no local refit finds the way back. With an observer each stretch is compared near its time. The observer is in
-the plant language (inputs `seen_*`, flows `correct_*`), so that search and refit work on it unchanged.
+An axis integrates every error. After a while the free run of a plant that lacks physics is far off, and
+no local refit converges to the right values. An observer keeps the states near the recorded ones. Its
+inputs `seen_*` and flows `correct_*` are part of the plant: search and refit need no change for it.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from thermoctl.plant.refit import Fit
 from thermoctl.plant.simulate import Excitation
 from thermoctl.plant.whitening import Noise
 
-LASTING = 20.0  # samples for which a missing flow holds: turns its variance into an intensity
-RESTING = 1e-3  # of the fastest state's slope: least slope of another, so that no state is without noise
-PURE = 1e-6  # share of the noise at a state that only integrates another: as good as none
-# Share of an error that a drifting mode keeps to the end of the recordings. In 60 generated cases axes
+LASTING = 20.0  # correlation time of a missing flow in samples: intensity of the noise over its variance
+RESTING = 1e-3  # least slope of a state over that of the fastest one, so that every state has process noise
+PURE = 1e-6  # factor on the process noise of a state that only integrates another: nearly none
+# A mode drifts if it keeps this share of an error to the end of the recordings. In 60 generated cases axes
 # keep all of it. The next mode, a coil that cools slowly, keeps 0.38.
 KEPT = 0.9
-TRUSTS = 0.01, 0.1  # process noise as a share of the slopes' own size; a larger one follows more closely
+# Values to try of the process noise over the slopes' size; with a larger one the plant follows more closely.
+TRUSTS = 0.01, 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +72,9 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
 
 
 def drifts(plant: Linear, duration: float) -> bool:
-    """Return whether a mode of the plant keeps an error over the recordings; False if unknown.
+    """Return whether a mode of the plant drifts: it keeps the share KEPT of an error; False if unknown.
 
-    A body that only cools slowly is no such mode: it is linear enough for a free run."""
+    A body that only cools slowly does not drift: it is linear enough for a free run."""
     known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
     return known and bool(np.max(np.linalg.eigvals(plant.a).real) > np.log(KEPT) / duration)
 
@@ -83,7 +84,7 @@ def held(plant: Plant, about: Linear, noise: Sequence[Noise], interval: float, t
     rate = np.maximum(about.rate, RESTING * about.rate.max())
     q = (trust * rate) ** 2 * LASTING * interval
     pure = (np.count_nonzero(about.a, axis=1) == 1) & (np.diag(about.a) == 0)
-    q[pure] *= PURE  # the position of a speed has no noise of its own
+    q[pure] *= PURE  # a position, the integral of a speed, has no process noise of its own
     r = np.array([n.sigma**2 * interval for n in noise])
     try:
         p = solve_continuous_are(about.a.T, about.c.T, np.diag(q), np.diag(r))

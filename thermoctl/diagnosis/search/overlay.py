@@ -29,7 +29,7 @@ class Trajectory:
         }
         self.first = d.first
         self.known: dict[int, np.ndarray] = {}
-        # inputs that hold, as they were until each sample
+        # values of held inputs just before each sample
         self.until = {
             i: np.concatenate([u[:1], u[:-1]])
             for i, u, linear in zip(rig.plant.inputs, d.u.T, d.linear, strict=False)
@@ -37,13 +37,13 @@ class Trajectory:
         }
 
     def own(self, e: ex.Expr) -> np.ndarray:
-        """The value of an expression of the plant itself, computed once."""
+        """Return the values (N,) of an expression of the plant itself, computed once."""
         if id(e) not in self.known:
             self.known[id(e)] = self.value(e, {})
         return self.known[id(e)]
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
-        """The value of an expression along the trajectory."""
+        """Return the values (N,) of an expression along the trajectory. `extra`: further names."""
         return np.broadcast_to(
             np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape
         )
@@ -56,7 +56,7 @@ def _hold(column: np.ndarray) -> np.ndarray:
 
 
 class Overlay:
-    """The changes of a plant by an extension: flows, storages, outputs, new nodes."""
+    """The parts of a plant that an extension changes: flows, storages, outputs, and new nodes."""
 
     def __init__(self, base: Plant, extended: Plant):
         self.base, self.states = base, list(base.nodes)
@@ -80,7 +80,7 @@ class Overlay:
     def changes(
         self, values: Mapping[str, float], at: Trajectory
     ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-        """Return the changes along a trajectory: of slopes dx/dt by state, of outputs by output.
+        """Return the changes (N,) along a trajectory: of slopes dx/dt by state, and of outputs by output.
 
         `values`: of the extension's parameters."""
         base = self.base
@@ -109,7 +109,7 @@ class Overlay:
 
 
 def _net(plant: Plant, node: str) -> ex.Expr:
-    """Return what flows into a node, as one expression."""
+    """Return the net flow into a node as one expression."""
     net: ex.Expr = ex.ZERO
     for f in plant.flows.values():
         if f.target == node:

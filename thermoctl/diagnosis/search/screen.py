@@ -1,15 +1,15 @@
 """Score test of every effect at every place: how much of the residual it could explain, without a refit.
 
-    r: whitened residual of the refit, the starts moved back to their priors' means
+    r: whitened residual of the refit, with initial states at the means of their priors
     d: first-order change of the outputs by an effect, whitened
-    r', d': the same without what the plant's unknowns absorb (metric.py)
+    r', d': r and d after projection, without the part that the plant's unknowns absorb (metric.py)
     gain = (d'^T r')^2 / (d'^T d')
 
 The gain is chi-square with one degree of freedom (k for k amplitudes) where nothing is missing.
-d comes from the effect laid over the plant. Its change of dx/dt along the fitted trajectory drives the
-linearised plant (`Model.respond`). Its change of the outputs adds directly. New nodes are integrated
-alone along that trajectory. Rows are sums over blocks of samples: white noise stays white, and thousands
-of directions fit in memory.
+d is computed from the plant with a small effect. Its change of dx/dt along the fitted trajectory drives the
+linearised plant (`Model.respond`). Its change of the outputs is added. New nodes are integrated alone along
+that trajectory. Rows are sums over blocks of samples: white noise stays white, and thousands of directions
+fit in memory.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.diagnosis.search.shapes import shape_grid
 from thermoctl.plant.cores import ABREAST, LEAST, each
 
-EPSILON = 1e-4  # amplitude at which a direction is taken
+EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
 CHUNK = 96
-EXACT = 4_000  # columns, up to which all are simulated
+EXACT = 4_000  # up to so many columns all are simulated
 
 
-Entry = tuple[Column, np.ndarray, float]  # its projected rows, and the norm of the whole ones
+Entry = tuple[Column, np.ndarray, float]  # a column, its rows after projection, its norm before
 
 
 def directions(
@@ -50,7 +50,7 @@ def directions(
 
 
 def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:
-    """Return the first-order changes by columns in recording r."""
+    """Return the first-order changes that the columns of a part cause in recording r."""
     forces: list[tuple[int, int]] = []
     values: list[np.ndarray] = []
     changed: dict[tuple[int, int], np.ndarray] = {}
@@ -64,7 +64,7 @@ def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:
 
 @dataclass(frozen=True)
 class Norms:
-    """A column that was simulated, the norm of its whitened rows, and that of their projection."""
+    """A simulated column; the norm of its whitened rows before (`whole`) and after projection (`left`)."""
 
     column: Column
     whole: float
@@ -85,8 +85,8 @@ def screen(
     """Return every candidate's best direction, best first, in each of the metrics.
 
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
-    Of more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). `norms` receives
-    those of the first metric, if all columns are simulated."""
+    If there are more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). If all
+    columns are simulated, their norms in the first metric are appended to `norms`."""
     first = metrics[0]
     at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
     groups = [g for c in found for g in groups_of(c, first, edges)]
@@ -117,7 +117,8 @@ def screen(
 def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
     """Return the direction with its onset (or start and end) refined to the sample.
 
-    A refit cannot move them: a jump has no slope to follow. Each step's grid is four times as fine."""
+    A refit cannot move them: a jump has no derivative by its time. Each grid is four times finer than the
+    one before."""
     kinds = found.candidate.effect.shapes.values()
     if "onsets" not in kinds and "windows" not in kinds:
         return found
@@ -142,7 +143,8 @@ def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
 class Group:
     """The columns of an effect at a place that are scored together: amplitudes at one shape, or onsets.
 
-    `sizes`: shape and direction in the amplitudes of each column. `overlay` of the candidate, made once."""
+    `sizes`: shape and direction in the amplitudes of each column. `overlay`: returns the candidate's Overlay,
+    which is built once."""
 
     candidate: Candidate
     number: Any
@@ -190,8 +192,8 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
         sizes = [tuple(s for part in sizes for s in part)]
 
     @cache
-    def overlay() -> Overlay:  # of every group: only the values differ
-        """Return the candidate laid over the plant."""
+    def overlay() -> Overlay:  # the groups share it: only their values differ
+        """Return the parts of the plant that the candidate changes."""
         return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]

@@ -25,9 +25,9 @@ from thermoctl.plant.residuals import Problem
 from thermoctl.plant.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
-FREE = 1e4  # prior standard deviation of an unknown whose prior does not count
-PROMISED = 30  # directions whose gain in log likelihood is predicted
-ROOM = 2  # times PLACES_EACH: places of one effect among them
+FREE = 1e4  # standard deviation that stands for no prior
+PROMISED = 30  # number of directions whose gain in log likelihood is predicted
+ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
 
 
 class Plain:
@@ -50,7 +50,8 @@ class Plain:
         found = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
         self.runs = [run for run, _, _ in found]
         self.residual = np.concatenate([residual for _, residual, _ in found])
-        self.sensitivities = [rows for *_, rows in found]  # of each recording (rows, k), to `unknowns`
+        # By recording (rows, k), with respect to `unknowns`.
+        self.sensitivities = [rows for *_, rows in found]
 
     def unknowns(self, r: int) -> np.ndarray:
         """Return the unknowns of recording r."""
@@ -68,7 +69,7 @@ def _rows(channels: Sequence[Channel], e: np.ndarray) -> np.ndarray:
 def _sensitive(
     problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
 ) -> tuple[Simulation, np.ndarray, np.ndarray]:
-    """Return a recording's run, and the rows of its residual and of its sensitivities."""
+    """Return a recording's run, and the DCT rows of its residual and of its sensitivities (rows, k)."""
     d = problem.excitations[r]
     run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
     assert run.dy is not None
@@ -99,9 +100,9 @@ def _response(
 class Rows(Metric):
     """Whitened rows of a refitted hypothesis: DCT rows divided by the rms of their noise.
 
-    `average`: spectra of the refit's residuals. `remainder`: does the remainder count as noise, too? If so,
-    errors at low frequencies have little weight. Without it the starts are free, as in a refit that brings
-    the run closest to the data."""
+    `average`: spectra of the refit's residuals. `remainder`: is the remainder part of the noise? If so,
+    errors at low frequencies have little weight. If not, the initial states are free, as in the refit in
+    white noise."""
 
     def __init__(self, plain: Plain, average: Averaged, remainder: bool):
         self.plain, self.fit, self.model = plain, plain.fit, plain.model
@@ -112,16 +113,17 @@ class Rows(Metric):
         self.around = Around(plain.grids, self._powers(self.residual))
 
     def _absorb(self, held: bool) -> np.ndarray:
-        """Set what the unknowns absorb; return how far the starts moved the outputs, not whitened (rows,).
+        """Set the directions that the unknowns absorb.
 
-        Are starts `held` by their priors? Parameters are free. Those at an end of their range absorb nothing.
-        Starts act in their own recording only: their directions are few, however many recordings."""
+        Parameters are free; those at an end of their range absorb nothing. Initial states are bound by their
+        priors if `held`, else they are free. Each acts in its own recording only, so that its directions are
+        few. Returns the change of the outputs by the fitted initial states, not whitened (rows,)."""
         unknowns, plain = self.plain.problem.unknowns, self.plain
         free = np.array([q not in self.fit.at_bound for q, _ in unknowns], bool)
         of_one = np.array([of is not None for _, of in unknowns], bool)
         shared = np.flatnonzero(free & ~of_one)
         sd, moved = np.full(len(unknowns), FREE), np.zeros(len(unknowns))
-        if held:  # in z their priors are standard normal
+        if held:  # in units of z the priors of initial states are standard normal
             starts = slice(plain.problem.n_parameters, None)
             sd[starts], moved[starts] = 1.0, self.fit.z[starts]
         self.own, common, out = [], [], []
@@ -167,17 +169,17 @@ class Rows(Metric):
         return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
     def rise(self, rows: np.ndarray) -> Callable[[np.ndarray], float]:
-        """Return a function: by how much the log likelihood of other rows is above that of these.
+        """Return a function of other rows: their log likelihood minus that of these rows.
 
         Rows are whitened, of all recordings; noise and remainder are averaged."""
         around = Around(self.plain.grids, self._powers(rows))
         return lambda others: around.rise(self._powers(others))
 
     def weighed(self, rows: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return by how much the log likelihood of other rows is above the residual's, and their weights.
+        """Return the log likelihood of other rows minus that of the residual, and new weights (rows,).
 
-        Rows are whitened; noise and remainder are averaged. The weights are those in the noise of the other
-        rows, as a multiple of the metric's."""
+        Rows are whitened; noise and remainder are averaged. The weights whiten in the noise that the other
+        rows imply, and are given as multiples of the metric's weights."""
         above, inverse = self.around.weighed(self._powers(rows))
         channels = zip(self.plain.coordinates.channels, inverse, strict=True)
         return above, np.concatenate([np.sqrt(v)[c.band] for c, v in channels]) / self.weight
@@ -196,7 +198,7 @@ class Rows(Metric):
 
 
 def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder: bool) -> list[np.ndarray]:
-    """One over the standard deviation of each row (rows,) of each channel."""
+    """Return one over the standard deviation of each row (rows,), by channel."""
     inverse = average.inverse
     if not remainder:
         own = {k: v for g, v in zip(case.grids, average.sensor, strict=True) for k in g.channels}
@@ -214,10 +216,10 @@ def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder:
 class Screened:
     """The catalogue's best directions; `promises`: predicted gain in log likelihood of each.
 
-    `energy`: the rows in the sensors' noise alone; `by_energy`: all directions by their gain there. Where the
-    plant has a large error, a first-order step predicts log likelihood badly, and energy is the better
-    guide. Empty where the residual is about the noise. `norms`: of all columns, empty where not all were
-    simulated."""
+    `energy`: the rows whitened by the sensors' noise alone; `by_energy`: all directions, sorted by their
+    gain there. Where the plant has a large error, a first-order step predicts the log likelihood badly, and
+    this gain in energy is a better guide. Both are empty where the residual is only noise. `norms`: of all
+    columns; empty where not all were simulated."""
 
     metric: Rows
     rig: Structure
@@ -229,9 +231,9 @@ class Screened:
 
 
 def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
-    """Screen the catalogue at the places of the original plant; a part that an effect added is no place.
+    """Screen the catalogue at the places of the original plant. Parts that an effect added are no places.
 
-    Where the residual is more than noise, in the noise alone, too: there by energy."""
+    Where the residual is more than noise, screen a second time with the sensors' noise alone: by energy."""
     refitted = as_refitted(case, fitted)
     plain = Plain(case, fitted, ROWS)
     metric = Rows(plain, refitted.average, True)
@@ -263,7 +265,7 @@ def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
 
 
 def places(case: Case) -> dict[str, set[str]]:
-    """Return the places of each effect that fits the plant. They share the effect's prior odds."""
+    """Return the places where each effect fits the plant. They share the effect's prior odds."""
     drives = case.drives(case.null.model)
     rig = Structure(case.plant, drives, [t.columns for t in case.tables])
     out: dict[str, set[str]] = {}

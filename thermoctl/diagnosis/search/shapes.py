@@ -1,4 +1,4 @@
-"""The values of an entry's shapes (onsets, periods, thresholds ...) that a screening looks at."""
+"""The values of an entry's shapes (onsets, periods, thresholds ...) that a screening tries."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.plant.simulate import Simulation
 
-REPEATED = 2.0  # periods over the span: fewer do not repeat
-BEYOND = 1 / 3, 2 / 3  # shares of the way from the last quantile to the extreme
-SLOW_TURNS, FINE_TURNS = 60.0, 4000  # each is looked at up to the first, the strongest up to the second
+REPEATED = 2.0  # least number of periods over the span of the signal
+BEYOND = 1 / 3, 2 / 3  # levels above the last quantile: shares of the way to the extreme
+# Periods over the span of the signal: up to the first number all are tried, up to the second the strongest.
+SLOW_TURNS, FINE_TURNS = 60.0, 4000
 
 
 def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
-    """Return the strongest numbers of turns over the signal x beyond SLOW_TURNS.
+    """Return the numbers of periods over the span of x, above SLOW_TURNS, at which errors are strongest.
 
-    They are peaks of the spectrum over x of `errors` ((N,) by recording) without their slow part in time."""
+    They are peaks of the spectrum over x. `errors`: (N,) by recording; their part that is slow in time is
+    removed first."""
     fast = []
     for e in errors:
         e = np.nan_to_num(e)
@@ -36,7 +38,7 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
     index = np.clip(((x[good] - np.min(x[good])) / span * bins).astype(int), 0, bins - 1)
     power = np.abs(np.fft.rfft(np.bincount(index, e[good], bins), 4 * bins))[
         : 4 * FINE_TURNS
-    ]  # by a quarter of a turn
+    ]  # in steps of a quarter of a period
     power[: int(4 * SLOW_TURNS)] = 0.0
     peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
     return peaks[np.argsort(-power[peaks])[:count]] / 4
@@ -46,10 +48,10 @@ Grid = list[dict[str, float]]
 
 
 def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> Grid:
-    """Return the values of a shape to look at in screening.
+    """Return the values of a shape that a screening tries.
 
-    `picked_from`: of how many values the residual itself picked this one. `longest`: a longer period does not
-    repeat in the recordings."""
+    A value may hold `picked_from`, the number of values from which the residual itself picked it. A period
+    holds `longest`, the longest period that repeats in the recordings."""
     if kind in ("onsets", "windows", "times", "lags", "delays"):
         return _times(kind, candidate.rig.duration, candidate.rig.sample, onsets)
     if kind in ("periods", "phases", "distances"):
@@ -83,7 +85,9 @@ def _signal(candidate: Candidate, runs: Sequence[Simulation], e: Expr) -> np.nda
 
 
 def _times(kind: str, duration: float, dt: float, onsets: int) -> Grid:
-    """Return moments of recordings of `duration` s, or times between their sampling time `dt` and it."""
+    """Return onsets or windows in recordings of `duration` s, or time constants of lags and delays.
+
+    `dt`: the sampling time in s. `onsets`: number of onsets."""
     if kind == "onsets":
         return [{"onset": float(v)} for v in np.linspace(0, duration, onsets + 2)[1:-1]]
     if kind == "windows":
@@ -108,7 +112,7 @@ def _positions(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> G
     if kind == "distances":
         return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]
     longest = span / REPEATED
-    # neighbouring periods differ by a quarter of a turn over the span
+    # over the span, neighbouring periods differ by a quarter of a period
     slow = [{"period": float(span / n), "longest": longest} for n in np.arange(REPEATED, SLOW_TURNS, 0.25)]
     if not candidate.place.output:
         return slow
@@ -119,7 +123,7 @@ def _positions(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> G
 
 
 def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
-    """Return levels of what is read, driven or flows."""
+    """Return levels of the reading, the input or the signal that the effect acts on."""
     symbols = _symbols(candidate)
     target = symbols.get("y") or symbols.get("u") or symbols.get("a")
     z = _signal(candidate, runs, target) if target is not None else np.array([0.0, 1.0])
@@ -134,5 +138,6 @@ def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid
         quantiles = [1 - q for q in quantiles]
     end = float(np.quantile(z, round(quantiles[-1])))
     levels = np.quantile(z, quantiles)
-    beyond = levels[-1] + np.array(BEYOND) * (end - levels[-1])  # a start or a pulse may be all that is there
+    # The signal may exceed the last quantile only in one pulse.
+    beyond = levels[-1] + np.array(BEYOND) * (end - levels[-1])
     return [{"level": float(v)} for v in np.unique([*levels, *beyond])]

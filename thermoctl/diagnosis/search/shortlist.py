@@ -19,8 +19,8 @@ from thermoctl.plant import expression as ex
 
 PAIR = 2
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
-HALF = 2.0  # times its first-order promise that a refit may gain
-ALIKE = 0.999  # cosine of two directions, above which they are one
+HALF = 2.0  # largest gain of a refit that is reckoned with, over its first-order promise
+ALIKE = 0.999  # limit of the cosine between two directions, so that their pair can be computed
 
 
 def relabels(c: Candidate) -> bool:
@@ -36,7 +36,7 @@ def relabels(c: Candidate) -> bool:
 
 
 def _free_member(c: Candidate, side: str) -> bool:
-    """Does the displacement hold this side's temperature already, with a coefficient that a refit moves?"""
+    """Does the displacement contain this side's temperature already, with a free coefficient?"""
     now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
     slope = ex.derivative(now, str(c.place.symbols[side].value))
     parameters = c.rig.plant.parameters
@@ -44,7 +44,7 @@ def _free_member(c: Candidate, side: str) -> bool:
 
 
 def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """Return the simpler entries at the same places, to try without an insignificant part."""
+    """Return the simpler entries at the places of `added`, to try instead of an insignificant effect."""
 
     def is_simpler(d: Direction, a: Direction) -> bool:
         """Return whether d is the simpler effect at the place of a."""
@@ -60,8 +60,8 @@ def shortlist(
 ) -> list[tuple[tuple[Direction, ...], float]]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
-    The best is first. Those with the largest gain in energy follow. Either list has at most
-    PLACES_EACH places of one effect."""
+    First are those with the largest predicted gain, the best first. Then come those with the largest gain in
+    energy, then pairs, both with an infinite gain. Each list has at most PLACES_EACH places of one effect."""
     paying = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
@@ -80,7 +80,7 @@ def shortlist(
 
 
 def largest(looked: Screened) -> list[Direction]:
-    """Return the foremost candidates whose gain in energy is at least half of the best one's."""
+    """Return the candidates whose gain in energy is at least half of the best one's, the best first."""
     enough = [d for d in looked.by_energy if HALF * d.gain > looked.by_energy[0].gain]
     best = foremost(once(d for d in enough if not relabels(d.candidate)), PLACES_EACH)
     return [dataclasses.replace(d, vector=None) for d in best]
@@ -89,7 +89,7 @@ def largest(looked: Screened) -> list[Direction]:
 def pairs(directions: Sequence[Direction], metric: Metric, limits: Thresholds) -> list[tuple[Direction, ...]]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
-    The plant's own parameters may imitate each alone, but not both together."""
+    The plant's own parameters may imitate each effect of a pair alone, but not both together."""
     kept = once(
         d
         for d in directions

@@ -3,17 +3,17 @@
     gain = ((P d)' r)^2 / |P d|^2,    d = W B y(q)
 
 - y(q): first-order response of the outputs to an effect's forces q (screen.py)
-- B: samples to DCT rows; W: the weights that whiten them; r: residual
-- P: takes off the part that the plant's own unknowns absorb
+- B: transform of samples to DCT rows; W: the weights that whiten the rows; r: residual
+- P: projection, which removes the part that the plant's own unknowns absorb
 
 The product of d with a row vector w is an inner product with the forces:
 
     w' d = sum_n q_n' l_n,    -dl/dt = J' l + B' W w
 
-l is a run of the adjoint plant, backwards, for each w. One run gives the numerators of all directions.
-SKETCHES more give the norms: with random signs s_k, the mean of ((P' s_k)' d)^2 is |P d|^2. Its relative
-standard deviation is sqrt(2 / SKETCHES). Links between all pairs of N bodies then cost products, and no
-simulation."""
+l is the state of the adjoint plant, simulated backwards for each w. One run gives the numerators of all
+directions. SKETCHES more runs give the norms: with random signs s_k, the mean of ((P' s_k)' d)^2 is |P d|^2.
+Its relative standard deviation is sqrt(2 / SKETCHES). So links between all pairs of N bodies need only inner
+products, and no simulation each."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from thermoctl.diagnosis.search.screen import Group
 from thermoctl.plant import expression as ex
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
-SKETCHES = 32  # a gain is known within 25 %
-KEPT = 1_500  # columns that are simulated, for each metric
-SAMPLES = 4_000  # of an adjoint run, at most; forces are summed from one to the next
-GAMMA = 1 - float(np.sqrt(0.5))  # of the method that integrates: two stages, second order, L-stable
+SKETCHES = 32  # number of sketches: a gain is known within 25 %
+KEPT = 1_500  # number of columns that are simulated, for each metric
+SAMPLES = 4_000  # largest number of samples of an adjoint run; forces are summed between samples
+GAMMA = 1 - float(np.sqrt(0.5))  # coefficient of the integration: two implicit stages, order 2, L-stable
 
 
 def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[Group]) -> list[Group]:
     """Return the best group of each of the likeliest candidates, up to KEPT columns for each metric.
 
-    All groups where the plant has no adjoint in this form: with a delay or an FMU."""
+    All groups are returned if the plant has a delay or an FMU: it then has no adjoint of this form."""
     code = metrics[0].model.code
     if code.input_delays or code.output_delays or code.fmus:
         return groups
@@ -55,7 +55,7 @@ def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[
 def products(
     metrics: Sequence[Metric], at: Sequence[Trajectory], columns: Sequence[Column]
 ) -> list[np.ndarray]:
-    """Return by metric the products (columns, 1 + SKETCHES) with the residual and the sketches."""
+    """Return the columns' products with residual and sketches (columns, 1 + SKETCHES), by metric."""
     vectors = [_vectors(metric) for metric in metrics]
     out = np.zeros((len(columns), len(metrics) * (1 + SKETCHES)))
     for r, trajectory in enumerate(at):
@@ -71,14 +71,14 @@ def products(
 
 
 def _vectors(metric: Metric) -> np.ndarray:
-    """Return the residual and the sketches (rows, 1 + SKETCHES), with the weights that whiten a row."""
+    """Return the residual and the sketches (rows, 1 + SKETCHES), projected and multiplied by the weights."""
     signs = np.random.default_rng(23).choice([-1.0, 1.0], (len(metric.weight), SKETCHES))
     whole = np.concatenate([metric.residual[:, None], signs / np.sqrt(SKETCHES)], axis=1)
     return metric.pulled(whole) * metric.weight[:, None]
 
 
 def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None:
-    """Return the direction of a group from its columns' products (k, 1 + SKETCHES)."""
+    """Return the best direction of a group, or None, from its columns' `products` (k, 1 + SKETCHES)."""
     rows, best = products[:, 1:].T, dict[int, Direction]()
     score(columns, rows, products[:, 0], np.linalg.norm(rows, axis=0), best)
     return next((d for d in best.values() if d.gain > 0), None)
@@ -99,7 +99,7 @@ def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarr
     """Return l (states, samples, k) for `pull` (N, outputs, k), and the first row of each sample.
 
     l is averaged over the rows of a sample. The method is the transpose of two implicit stages over each
-    interval h, with the forces on straight lines between rows:
+    interval h, with forces that are linear between rows:
 
         M k1 = J x + q(GAMMA),   M k2 = J (x + (1 - GAMMA) h k1) + q(1),   M = 1 - GAMMA h J
         x' = x + h ((1 - GAMMA) k1 + GAMMA k2)"""

@@ -8,8 +8,8 @@ errors over its noise.
 
 The effect is confirmed with the probability that Wilcoxon's signed-rank statistic of d is smaller by
 chance. A wrong effect helps in the one part whose misfit it imitates, a right one in most parts. So no score
-within the fitted data replaces this test. With recordings set aside, d is that of their parts, at the refits
-themselves.
+within the fitted data replaces this test. With recordings set aside, the parts are those of these recordings,
+each simulated with the refits, and nothing is fitted to them.
 
 Rows of a smooth error are not independent. An output counts as its number of equivalent draws, the
 participation ratio 3 (sum R^2)^2 / sum R^4 of its DCT rows R."""
@@ -35,11 +35,11 @@ from thermoctl.plant.climb import bounded_step
 from thermoctl.plant.simulate import SimulationError
 from thermoctl.recording.table import Table
 
-BLOCKS = 8  # of each recording
-FLOOR = 0.1  # mean square over the noise, far below which an error is not smaller, but luck
-WIDTH = 2.0  # prior sd of an effect's size about none, in its refitted size
-DRAWS = 3.0  # participation ratio of n independent rows: n / 3
-SWEEPS = 2  # solutions, after each of which the outputs' weights are set anew
+BLOCKS = 8  # parts of each recording
+FLOOR = 0.1  # added to mean squares over the noise: differences between errors far below it are chance
+WIDTH = 2.0  # prior sd of an effect's size about its null value, as a multiple of the refitted size
+DRAWS = 3.0  # n independent normal rows have the participation ratio n / 3
+SWEEPS = 2  # solutions; after each, the outputs' weights are computed again
 TINY = 1e-9
 
 
@@ -78,14 +78,15 @@ class Blocks:
                 self.count[r, b] = seen.sum(axis=0)
         self.recording = np.array([-1 if r is None else r for _, r in problem.unknowns])
         self.low, self.high = (np.array(bound) for bound in log.bounds)
-        self.prior, self.pull = self._believed(log, values)
+        self.prior, self.pull = self._prior(log, values)
         rows = self.count.sum(axis=(0, 1))
         self.share = np.minimum(draws, rows) / np.maximum(rows, 1.0)
 
-    def _believed(self, log: Posterior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _prior(self, log: Posterior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return precision (k, k) and gradient at z (k,) of the prior, as one Gaussian.
 
-        A size lies about none, so that an effect may vanish where the other parts do not need it."""
+        The prior of an effect's size is centred on its null value: the effect may vanish where the other
+        parts do not need it."""
         problem, z = log.problem, self.z
         _, push, bend = problem.prior_terms(values, True)
         precision, step = log.precision.copy(), log.mean - z
@@ -109,7 +110,7 @@ class Blocks:
         return bounded_step(self.z, gradient, matrix, 0.0, (self.low, self.high))[0]
 
     def _own(self, r: int, step: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Return the step with the unknowns of one recording, such as its start, fitted to all of it."""
+        """Return the step with the unknowns of recording r (its initial states) refitted to all of r."""
         own = np.flatnonzero(self.recording == r)
         if not len(own):
             return step
@@ -125,7 +126,9 @@ class Blocks:
 
     @cached_property
     def predicted(self) -> np.ndarray:
-        """Mean squares over the noise (recordings, BLOCKS, outputs) of parts that were left out; else NaN."""
+        """Mean squares over the noise (recordings, BLOCKS, outputs) of each part, predicted from the others.
+
+        NaN where an output was not measured."""
         whole, rows = self.sums.sum(axis=(0, 1)), np.maximum(self.count.sum(axis=(0, 1)), 1.0)
         energy = whole[:, -1, -1] / rows
         for _ in range(SWEEPS):
@@ -157,7 +160,7 @@ def _draws(error: np.ndarray) -> float:
 
 @dataclass
 class Confirm:
-    """The test of the effects of one diagnosis; parts of hypotheses are linearised once.
+    """The test of the effects of one diagnosis. Each hypothesis is linearised once.
 
     `tried`: the hypotheses; `reserve`: recordings that took no part in any choice."""
 
@@ -189,7 +192,9 @@ class Confirm:
         return self._known[keys]
 
     def _left_out(self, keys: Keys) -> np.ndarray | None:
-        """Return the mean squares of parts that were left out, of the better of a hypothesis' two refits."""
+        """Return the mean squares of parts that were left out.
+
+        A hypothesis has two refits (`as_refitted`). The one that fits better is used."""
         f = self.tried[keys]
         both = [Blocks(self.case, f), Blocks(self.case, as_refitted(self.case, f))]
         best = min(both, key=lambda b: float(np.sum(np.log(_fitted(b)))))
@@ -231,9 +236,9 @@ def _fitted(b: Blocks) -> np.ndarray:
 def confirmed(
     posterior: Probabilities, best: Keys, test: Confirm, name: float
 ) -> tuple[Keys, Probabilities, dict[Key, float]]:
-    """Return the effects of a hypothesis that stay, the posterior, and the probability of each test.
+    """Return the confirmed effects of a hypothesis, the posterior, and each tested effect's probability.
 
-    An effect below `name` leaves, the weakest first; then the rest is asked again."""
+    The effect with the lowest probability below `name` is removed. Then the others are tested again."""
     asked: dict[Key, float] = {}
     keys = best
     while True:

@@ -1,6 +1,6 @@
 """Verdict from posterior, remainder and held-out error: a pure function.
 
-The first row of a table whose condition holds decides."""
+The first row of ROWS whose condition holds decides."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thermoctl.diagnosis.limits import Thresholds
 class Probabilities:
     """Probability of each hypothesis tried (by its effects), and of each effect.
 
-    `something`: that some effect or law is there"""
+    `something`: probability that at least one effect or law is there"""
 
     hypotheses: Mapping[frozenset[Key], float]
     effects: Mapping[Key, float]
@@ -29,12 +29,14 @@ class Probabilities:
 class Facts:
     """All numbers that a verdict depends on.
 
-    - `something`: probability that some effect or law is there; `known`: the same, 0 if nothing confirms one
+    - `something`: probability that at least one effect or law is there
+    - `known`: the same; 0 if other data confirmed no effect or law
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
     - `remains`: the largest probability of a remainder at an output
     - `flow`: probability that a flow is missing which no output shows alone
-    - `worth`: held-out error, divided by that of a refit alone; `worse`: probability that it is larger"""
+    - `worth`: held-out error with the findings, divided by that of the refitted plant
+    - `worse`: probability that the held-out error is larger with the findings"""
 
     something: float
     known: float
@@ -106,7 +108,7 @@ ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
 
 
 def decide(posterior: Probabilities, facts: Facts, limits: Thresholds) -> Decision:
-    """The first row that holds."""
+    """Return the decision by the first row of ROWS whose condition holds."""
     row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
     numbers = {
         "something": facts.something,

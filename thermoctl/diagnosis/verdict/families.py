@@ -1,4 +1,4 @@
-"""Effects that imitate each other, taken together: one of them may be sure where none is.
+"""Families of effects that imitate each other. It may be sure that one of a family is there, but not which.
 
 Two effects are of one family where a catalogue entry mimics or contains the other, or where they are one
 entry at two places."""
@@ -31,10 +31,11 @@ def families(
     asked: Mapping[Key, float],
     name: float,
 ) -> tuple[Family, ...]:
-    """Return the families of two or more effects that are there with probability `name`.
+    """Return the families of which one effect is there with probability `name` or more.
 
-    Each is gathered about its likeliest member; none of its members is `named`. `physics`: probability that
-    an effect of a hypothesis is no misfit. `asked`: that it predicts data that it was not fitted to."""
+    A family is all effects that are related to its likeliest member: two or more, none of them `named` or
+    related to one that is. `physics`: probability that an effect of a hypothesis is no misfit. `asked`: for
+    the effects that were tested, the probability that they predict data that they were not fitted to."""
     likely = sorted(
         (k for k, p in posterior.effects.items() if p >= MEMBER), key=lambda k: (-posterior.effects[k], k)
     )

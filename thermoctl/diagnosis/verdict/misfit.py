@@ -1,10 +1,10 @@
 """Is an effect physics, or the shape of a misfit that nobody will name?
 
-Every plant is also wrong in small ways, whose misfits have the shapes of effects. Their energy is what a
-hypothesis leaves. Along the direction of one effect such a misfit is normal: along each parameter of the
-effect lies the share `alike` of its energy. Readings share the causes of their misfits, so these are taken
-together. A reading o without a misfit tells the effect's size up to the noise of its n_o rows. The size of a
-true effect is log-uniform. With r, the effect's size in standard deviations of all readings together,
+Every plant is also wrong in small ways, and these misfits have the shapes of effects. Their energy stays in
+the residuals of every hypothesis. Along each parameter of an effect, such a misfit has a normal distribution.
+Its variance is the share `alike` of that energy. One cause may act on several readings, so their energies are
+added. A reading o without a misfit determines the effect's size up to the noise of its n_o rows. The size of
+a true effect is log-uniform. With r, the effect's size in standard deviations of all readings together,
 
     r^2 = (energy that the effect removes) / (share (energy that stays))  of readings with a misfit
           + sum_o n_o (energy that it removes)                            of readings without one
@@ -27,13 +27,13 @@ from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import Searched
 
-MISFIT = 0.5  # probability of being physics, below which an effect is rather a misfit
+MISFIT = 0.5  # probability of being physics; an effect below it is taken for a misfit
 SURE = 200.0  # r^2 beyond which the probability is 1 in any case
 
 
 @dataclasses.dataclass(frozen=True)
 class Energy:
-    """Of each output: mean square of residuals over the noise, the part beyond the noise, number of rows."""
+    """By output: mean square of the residuals over the noise, its part above the noise, number of rows."""
 
     squares: tuple[float, ...]
     misfit: tuple[float, ...]
@@ -51,12 +51,14 @@ def standing(
     contains: Mapping[str, str],
     limits: Thresholds,
 ) -> dict[frozenset[Key], dict[Key, float]]:
-    """Return the hypotheses of which an effect stands out of the misfit: the probability of each.
+    """Return the probability that each effect of a hypothesis is physics, by hypothesis.
 
-    An effect has to stand out against the best tried hypothesis that holds part of the others. Effects that
-    do not are part of the misfit. The others then have to stand out beside them or without them. An effect
-    that does not stand out against the simpler one that it contains is that one: no hypothesis holds it.
-    `dims`: number of parameters of each effect; `contains`: the simpler effect of some."""
+    Hypotheses with effects are left out if no effect of theirs stands out of the misfit. An effect is
+    compared with the best tried hypothesis that holds no effect but some of the others. Effects that do not
+    stand out are part of the misfit. The others then have the larger of their probabilities beside them and
+    without them. A hypothesis is left out, too, if an effect in it does not stand out against the simpler
+    entry that it contains. `dims`: number of parameters of each effect; `contains`: by entry, the simpler
+    one."""
     found: dict[frozenset[Key], dict[Key, float]] = {}
     simpler = set()
     for home in sorted(energy, key=len):
@@ -83,7 +85,7 @@ def _is_simpler(
     contains: Mapping[str, str],
     limits: Thresholds,
 ) -> bool:
-    """Return whether an effect of a hypothesis is the simpler one that it contains, and a misfit."""
+    """Return whether an effect of a hypothesis adds only a misfit to the simpler entry that it contains."""
     effect, where = key
     simple = (contains.get(effect, ""), where)
     other = energy.get(home - {key} | {simple})
@@ -94,17 +96,17 @@ def _is_simpler(
 
 
 def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
-    """Return the effects that are rather physics than a misfit."""
+    """Return the effects that are more probably physics than a misfit."""
     return frozenset(key for key, p in of.items() if p > MISFIT)
 
 
 def supported(
     likeliest: frozenset[Key], found: Mapping[frozenset[Key], Mapping[Key, float]]
 ) -> frozenset[Key]:
-    """Return the effects of a hypothesis without those that are rather a misfit.
+    """Return the effects of a hypothesis without those that are more probably a misfit.
 
-    The weakest is left out first. Of two that explain the same, neither stands out beside the other, and the
-    stronger one does without it. `found`: as of `standing`."""
+    The weakest is left out first. Of two effects of the same shape, neither stands out beside the other. The
+    stronger one stands out once the weaker one is left out. `found`: the result of `standing`."""
     keys = likeliest
     while own := found.get(keys, {}):
         weakest = min(own, key=lambda key: own[key])
@@ -130,10 +132,10 @@ def physics(without: Energy, beside: Energy, share: float) -> float:
 def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[frozenset[Key], Energy]:
     """Return the energies of all hypotheses.
 
-    Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there.
-    The noise is what the leading hypothesis learnt: a stated one that is too large would hide the misfit.
-    Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it.
-    Of the two refits of a hypothesis the better one counts."""
+    Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there. The
+    noise is the estimate of the leading hypothesis: a stated noise that is too large would hide the misfit.
+    Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it. A
+    hypothesis has two refits (`as_refitted`). The one with less energy is used."""
     leader = searched.tried[0].fitted
     own = np.add(leader.average.sensor, timing(case, leader))
     noise = list(zip(own, rounded(case), strict=True))

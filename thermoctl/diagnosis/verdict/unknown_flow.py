@@ -1,16 +1,16 @@
 """Is a flow missing that no single reading shows?
 
 Each reading's noise may hide a slow error, but a flow into one node reaches several readings together. An
-unknown flow into a node, or along a flow from node to node, is a hypothesis like any other. It is straight
-lines between KNOTS knots of each recording. Their values w are independent and normal, with the share eta
+unknown flow into a node, or along a flow from node to node, is a hypothesis like any other. It is piecewise
+linear between KNOTS knots in each recording. Their values w are independent and normal, with the share eta
 of the typical flow there as sd. X holds the responses to them, without the part that the plant's own
 parameters absorb. r is the residual. By Laplace's method, at the likeliest w,
 
     log p(D | flow) = log p(r - X w) - 1/2 w'w - 1/2 log |1 + X' V^-1 X|.
 
 Noise and remainder are averaged as always. 1/V is their mean for r - X w, because part of the noise may be
-the flow. eta is log-uniform over SHARES. Readings that rest on the steps of their rounding err with the
-signal, so they do not count.
+the flow. eta is log-uniform over SHARES. Coarsely rounded readings have errors that depend on the signal, so
+they do not count.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulate import SimulationError
 
-KNOTS, FEWEST, TOGETHER = 24, 6, 240  # of a recording; least number; about so many in all recordings
-ROUNDS, SETTLED = 4, 0.1  # of flow and noise in turn, until the evidence changes by fewer nats
+# Knots of a recording, at most and at least, and about how many in all recordings together.
+KNOTS, FEWEST, TOGETHER = 24, 6, 240
+# Iterations of flow and noise in turn, at most; they end where the evidence changes by fewer nats.
+ROUNDS, SETTLED = 4, 0.1
 SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
 
 
@@ -45,8 +47,8 @@ class Missing:
     node: str | None = None
     sentence: str = ""
 
-    def told(self, verdict: str, limits: Thresholds) -> str:
-        """Return the sentence, if it is certain, or beside effects that are not certain either."""
+    def doubt(self, verdict: str, limits: Thresholds) -> str:
+        """Return the sentence if the flow is certain, or possible and the verdict ambiguous; else ''."""
         if self.probability >= limits.name:
             return self.sentence
         if verdict == "ambiguous" and self.probability > 1 - limits.set:
@@ -57,7 +59,7 @@ class Missing:
 def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Thresholds) -> Missing:
     """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
 
-    Its prior odds are those of a piece of physics, and of an unknown function of time."""
+    Its prior odds are `missing` (any physics) times `rare` (a function of time), shared among its places."""
     try:
         gains = flow_gains(case, f, nodes)
     except (SimulationError, np.linalg.LinAlgError):
