@@ -21,7 +21,6 @@ from tests.architecture import (
 # Present exceptions, each to be removed with its cause. An exception that is no longer needed fails, too.
 ARROWS: set[tuple[str, str]] = set()
 CIRCLES: list[str] = []
-FULL = {"thermoctl/plant": 27, "thermoctl/recording": 18}  # folders of more than 15 modules
 INSIDE_FUNCTIONS = {"cli", "commands", "root_commands", "daemon"}  # all but the last should be left
 
 
@@ -59,7 +58,7 @@ def test_no_arrow_goes_up_and_no_folder_grows_beyond_a_screen(graph):
     """A package that is on no floor imports one above it."""
     placed = {p for level in floors(graph) for p in level}
     assert placed == {package(m) for m in graph}
-    assert {f: n for f, n in folders().items() if n > FULL.get(f, 15)} == {}
+    assert {f: n for f, n in folders().items() if n > 15} == {}
 
 
 def test_only_the_command_line_imports_inside_functions():

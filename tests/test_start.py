@@ -20,15 +20,15 @@ FORBIDDEN = {  # by command: modules that it has no use for
         "scipy.signal",
         "thermoctl.diagnosis.evidence.fit",
     },
-    "effects": {*SLOW, "pyarrow", "scipy", "thermoctl.plant.simulate"},
+    "effects": {*SLOW, "pyarrow", "scipy", "thermoctl.plant.simulation.simulate"},
     "diagnose --explain nothing": {
         *SLOW,
         "scipy",
         "thermoctl.diagnosis.evidence.fit",
         "thermoctl.fleet.commands",
     },
-    "recordings list": {*SLOW, "scipy", "thermoctl.plant.simulate"},
-    "devices list": {*SLOW, "scipy", "thermoctl.plant.simulate"},
+    "recordings list": {*SLOW, "scipy", "thermoctl.plant.simulation.simulate"},
+    "devices list": {*SLOW, "scipy", "thermoctl.plant.simulation.simulate"},
 }
 RUN = """import sys
 import thermoctl.cli

@@ -12,8 +12,8 @@ from thermoctl.advice.plan import plan
 from thermoctl.cli import main
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.plant import load, loads, save
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError
 

@@ -48,9 +48,9 @@ from thermoctl.diagnosis.search.screening import screened
 from thermoctl.fleet.jobs import Job
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
-from thermoctl.plant.estimate import report
+from thermoctl.plant.fitting.estimate import report
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulate import Excitation, SimulationError
+from thermoctl.plant.simulation.simulate import Excitation, SimulationError
 from thermoctl.yamlfile import InputError
 
 SHORT, MOST = 8, 3

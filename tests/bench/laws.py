@@ -31,7 +31,7 @@ from thermoctl.diagnosis.law.signals import Place, signals
 from thermoctl.diagnosis.law.smooth import LATENT, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 MOST = 600  # samples that a peer is given
 Predict = Callable[[np.ndarray], np.ndarray]

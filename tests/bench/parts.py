@@ -26,8 +26,8 @@ EVERY = 0.005  # s of processor time between two samples
 HERE = Path(__file__).parents[2]
 # of the innermost frame that is in one of them: a part of the file's path, name of the function ("" is any)
 STAGES = (
-    ("plant/compile.py", "", "compiler"),
-    ("plant/build.py", "", "compiler"),
+    ("plant/simulation/compile.py", "", "compiler"),
+    ("plant/native/build.py", "", "compiler"),
     ("/noise.py", "", "likelihood"),
     ("/spectra.py", "", "likelihood"),
     ("/screen", "", "screening"),
@@ -45,8 +45,8 @@ STAGES = (
     ("/case.py", "", "first refit"),
     ("/fit.py", "", "refits"),
     ("/posterior.py", "", "refits"),
-    ("plant/refit.py", "", "refits"),
-    ("plant/climb.py", "", "refits"),
+    ("plant/fitting/refit.py", "", "refits"),
+    ("plant/fitting/climb.py", "", "refits"),
 )
 NAMES = ("imports", "simulate", "with slopes", *dict.fromkeys(stage for _, _, stage in STAGES), "else")
 
@@ -57,7 +57,7 @@ def stage(frame: FrameType | None) -> str:
         file, name = frame.f_code.co_filename, frame.f_code.co_name
         if name == "<module>" and frame.f_back is not None or file.startswith("<frozen importlib"):
             return "imports"
-        if file.endswith("plant/simulate.py") and name in ("_run", "respond"):
+        if file.endswith("plant/simulation/simulate.py") and name in ("_run", "respond"):
             slopes = name == "respond" or frame.f_locals.get("sensitivities")
             return "with slopes" if slopes else "simulate"
         for part, function, label in STAGES:

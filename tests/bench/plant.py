@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 
 from thermoctl.identify.linearise import thermal
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 RTOL = 1e-7

@@ -54,7 +54,7 @@ def read(path):
 """,
     "thermoctl": """
 import numpy as np
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 def read(path):
     table = read_recording(path)
     return float(table.t[-1] + sum(np.nansum(c) for c in table.columns.values()))

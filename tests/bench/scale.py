@@ -32,15 +32,15 @@ import numpy as np
 
 from tests.plants import TWO_BLOCKS
 from thermoctl.plant import load
+from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 BODY = """
 import json, os, resource, sys, time
 from thermoctl.diagnosis.run import diagnose_files
-from thermoctl.plant import residuals
+from thermoctl.plant.fitting import residuals
 calls, side_by_side = [], residuals.each
 def timed(f, items, numbers):  # on one core these run one after the other
     calls.append([])

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.plants import FREE_CARRIAGE, ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.plant import Plant, loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PENDULUM = """\

@@ -8,7 +8,7 @@ import pytest
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 

@@ -35,9 +35,9 @@ from thermoctl.diagnosis import run as diagnosis
 from thermoctl.fleet.jobs import program
 from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save
-from thermoctl.plant.estimate import updated
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.fitting.estimate import updated
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.report import page
 from thermoctl.yamlfile import InputError

@@ -15,7 +15,7 @@ from thermoctl import cli
 from thermoctl.configuration.which_rig import ACTS
 from thermoctl.daemon import lock
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 

@@ -11,7 +11,7 @@ from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.result import doubts
 from thermoctl.plant import load, loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

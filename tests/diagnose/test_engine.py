@@ -11,7 +11,7 @@ import pytest
 
 from thermoctl.cli import main
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 PLANT = """
 format: thermoctl-plant/1

@@ -17,7 +17,7 @@ from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 HEATER = """

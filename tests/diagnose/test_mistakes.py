@@ -14,7 +14,7 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.mistakes import MISTAKES
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 BLOCK = "one block"
 

@@ -21,7 +21,7 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import search
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

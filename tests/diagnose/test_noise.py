@@ -19,7 +19,7 @@ from thermoctl.diagnosis.evidence.densities import NOISE, REMAINDER
 from thermoctl.diagnosis.evidence.densities import SLOW as SLOW_NOISE
 from thermoctl.diagnosis.evidence.levels import floor
 from thermoctl.diagnosis.evidence.noise import Around, Averaged, averaged
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 
 ROWS, SIGMA, SWING = 2000, 0.05, 5.0
 SHARE = 0.4  # of the noise's variance, that is not white

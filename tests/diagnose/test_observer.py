@@ -11,9 +11,9 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search import beam as search
 from thermoctl.diagnosis.search.observer import drifts, held, linear
 from thermoctl.plant import loads
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import SimulationError, compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 RUBBED = FREE_CARRIAGE.replace(

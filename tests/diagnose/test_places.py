@@ -16,7 +16,7 @@ from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 MOTOR = """format: thermoctl-plant/1

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import beam as search
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

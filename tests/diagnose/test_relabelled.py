@@ -13,7 +13,7 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import absurd, relabelled
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 CLOSE = TWO_BLOCKS.replace("0.02, unit: W/K, range: [0.004, 0.08]", "0.2, unit: W/K, range: [0.04, 1]")
 RADIATES = CLOSE.replace(

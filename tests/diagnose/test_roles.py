@@ -15,7 +15,7 @@ from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 OSCILLATOR = """

@@ -11,10 +11,10 @@ import pytest
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.data.rows import CHANCE, LONG, _content, reduced
 from thermoctl.plant import load
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import Noise
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 ROWS = 30_000

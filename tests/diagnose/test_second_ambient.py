@@ -12,7 +12,7 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import _followed, started
 from thermoctl.diagnosis.search.screening import screened
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 WALL = 'flows:\n  wall: {from: one, rate: "0.004 * (one - 21 - 3 * sin(t / 900))", unit: W}\n'

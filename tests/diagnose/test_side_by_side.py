@@ -10,8 +10,9 @@ import numpy as np
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import beam as search
-from thermoctl.plant import cores, load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant import load
+from thermoctl.plant.fitting import cores
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 

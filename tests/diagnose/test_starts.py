@@ -12,7 +12,7 @@ from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import started
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 SPILL = 'flows:\n  spill: {from: tank, rate: "0.6 * max(tank - 2.75, 0)", unit: V/s}\n'

@@ -14,7 +14,7 @@ from thermoctl.diagnosis.law.smooth import _smoothed
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search.overlay import _filtered
 from thermoctl.diagnosis.search.screening import FREE, ROWS, Plain, Rows
-from thermoctl.plant import residuals
+from thermoctl.plant.fitting import residuals
 
 
 @pytest.fixture(scope="module")

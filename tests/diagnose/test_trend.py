@@ -10,7 +10,7 @@ import pytest
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.dates import line
 from thermoctl.recording.table import Table
 

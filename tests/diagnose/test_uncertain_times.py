@@ -10,7 +10,7 @@ import pytest
 from tests.plants import SPRING_STAGE
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 RATE, SHARE = 200.0, 0.03  # samples a second; error of a time in sampling intervals

@@ -10,7 +10,7 @@ from tests.diagnose.test_roles import blocks
 from thermoctl.diagnosis.data.coordinates import Coordinates
 from thermoctl.diagnosis.evidence.where import responses, white_forces
 from thermoctl.plant import from_plain
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 

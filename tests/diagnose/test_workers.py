@@ -14,9 +14,9 @@ from thermoctl.diagnosis import workers as dask_workers
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.workers import cluster
 from thermoctl.plant import load
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.fitting.whitening import default_noise
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -14,8 +14,8 @@ from thermoctl import cli
 from thermoctl.export.commands import write
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
-from thermoctl.plant.equations import Equations, argument
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.equations import Equations, argument
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.yamlfile import InputError
 

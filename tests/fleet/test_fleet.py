@@ -10,7 +10,7 @@ from thermoctl.cli import main
 from thermoctl.fleet.health import summarise
 from thermoctl.fleet.trend import drift, judge
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 

@@ -10,7 +10,7 @@ import pytest
 from tests.hal.conftest import CONFIG, make_settings
 from thermoctl import yamlfile
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import (

@@ -25,11 +25,11 @@ from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import law_rate
 from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
-from thermoctl.plant.estimate import updated
+from thermoctl.plant.fitting.estimate import updated
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Input, Parameter, Plant
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 DRAWN, NONE = 16, 40  # laws from the grammar; cases without a law

@@ -14,10 +14,10 @@ import numpy as np
 from tests.plants import TWO_BLOCKS
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Flow, Node, Plant
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 STAGE = """\

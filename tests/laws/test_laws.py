@@ -36,7 +36,7 @@ from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))

@@ -10,9 +10,9 @@ import pytest
 
 from thermoctl.cli import main
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs/examples/heater"
 

@@ -10,7 +10,7 @@ import pytest
 
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 

@@ -22,7 +22,7 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
 from thermoctl.plant import Plant, load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -17,11 +17,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermoctl.plant import load, loads
-from thermoctl.plant.estimate import report
-from thermoctl.plant.noise import coloured
-from thermoctl.plant.refit import fit
-from thermoctl.plant.residuals import Scale
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.fitting.estimate import report
+from thermoctl.plant.fitting.noise import coloured
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.residuals import Scale
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 HEAD = "format: thermoctl-plant/1\n"

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 PLANTS = Path(__file__).parents[2] / "config" / "plants"
 ELECTRIC = ("u_integral", "i_coil", "velocity", "position")

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from thermoctl.plant.climb import Spot, bounded_step, climb
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.fitting.climb import Spot, bounded_step, climb
+from thermoctl.plant.simulation.simulate import SimulationError
 
 
 @settings(max_examples=60, deadline=None)

@@ -16,9 +16,9 @@ from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.export.commands import write
 from thermoctl.plant import Plant, load, save
-from thermoctl.plant.fmu import opened
+from thermoctl.plant.native.fmu import opened
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

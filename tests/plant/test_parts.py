@@ -8,9 +8,9 @@ import pytest
 import thermoctl as tc
 from thermoctl.cli import main
 from thermoctl.plant.files import loads
+from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.parts import in_parts
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PLANT = """format: thermoctl-plant/1

@@ -10,10 +10,10 @@ from thermoctl import cli
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Conversion
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.plant.units import as_recorded, in_plant_units
 from thermoctl.recording.files import read_table
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.table import Table
 from thermoctl.units import conversion
 from thermoctl.yamlfile import InputError

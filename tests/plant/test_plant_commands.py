@@ -11,7 +11,7 @@ from thermoctl.identify.linearise import discrete, gains, linearise, thermal
 from thermoctl.identify.modelfile import load_model
 from thermoctl.plant import extended, load
 from thermoctl.plant.show import layout
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError

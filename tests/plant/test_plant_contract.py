@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl import yamlfile
 from thermoctl.plant import load, loads, save
-from thermoctl.plant.estimate import updated
+from thermoctl.plant.fitting.estimate import updated
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import FLICKER_DECADES, ROLES, SensorNoise
-from thermoctl.plant.refit import fit
-from thermoctl.plant.sensor import error
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.sensor import error
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.simulated.rig import PlantRig

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 
 from thermoctl import cli
 from thermoctl.plant import load, loads
-from thermoctl.plant.new import TEMPLATES
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.first.new import TEMPLATES
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 SIGMA = 5.67e-8  # Stefan and Boltzmann, W/m^2/K^4

@@ -7,11 +7,11 @@ from scipy.signal import lfilter
 from thermoctl.cli import main
 from thermoctl.plant import expression as ex
 from thermoctl.plant import extended, loads
-from thermoctl.plant.estimate import report
-from thermoctl.plant.noise import coloured, innovations
-from thermoctl.plant.refit import fit
-from thermoctl.plant.residuals import Prior, Problem
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.fitting.estimate import report
+from thermoctl.plant.fitting.noise import coloured, innovations
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.residuals import Prior, Problem
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 
@@ -175,7 +175,7 @@ def test_parameters_that_trade_along_a_curve_are_followed_in_fewer_steps(monkeyp
 
     monkeypatch.setattr(Problem, "evaluate", counted)
     for bent in (0.75, 0.0):
-        monkeypatch.setattr("thermoctl.plant.climb.CURVED", bent)
+        monkeypatch.setattr("thermoctl.plant.fitting.climb.CURVED", bent)
         slopes.append(0)
         costs = [
             fit(model, [model.excitation(table)], start=np.random.default_rng(k).uniform(0.35, 0.65, 6)).cost

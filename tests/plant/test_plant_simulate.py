@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from tests.bench.scale import block_plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
@@ -207,7 +207,7 @@ def test_a_factorisation_by_table_gives_the_same_bytes_as_one_written_out(monkey
     columns = {i.column: 20 + 5 * np.sin(t / 60 + k) for k, i in enumerate(plant.inputs.values())}
     runs = []
     for written_out in (0, 10_000):
-        monkeypatch.setattr("thermoctl.plant.equations.WRITTEN_OUT", written_out)
-        monkeypatch.setattr("thermoctl.plant.compile._LOADED", {})
+        monkeypatch.setattr("thermoctl.plant.simulation.equations.WRITTEN_OUT", written_out)
+        monkeypatch.setattr("thermoctl.plant.simulation.compile._LOADED", {})
         runs.append(compile_plant(plant).simulate(Table("run", "run", t, columns), sensitivities=True))
     assert np.array_equal(runs[0].y, runs[1].y) and np.array_equal(runs[0].dy, runs[1].dy)

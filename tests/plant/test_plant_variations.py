@@ -6,7 +6,7 @@ import sympy
 from scipy.integrate import solve_ivp
 
 from thermoctl.plant import loads
-from thermoctl.plant.simulate import RTOL, compile_plant
+from thermoctl.plant.simulation.simulate import RTOL, compile_plant
 from thermoctl.recording.table import Table
 
 HEAD = "format: thermoctl-plant/1\n"

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from thermoctl.plant import load
-from thermoctl.plant.estimate import updated
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.fitting.estimate import updated
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
 
 FOLDER = Path(os.environ.get("THERMOCTL_RECORDINGS", Path(__file__).parents[3] / "shared/recordings"))

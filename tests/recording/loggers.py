@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.table import Table
 
 PAGE = Path(__file__).parents[2] / "docs/reference/loggers.md"

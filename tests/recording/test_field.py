@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.yamlfile import InputError
 
 ISO = "2026-03-01 10:00:0"

@@ -4,7 +4,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from thermoctl import cli
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 
 
 @pytest.fixture(autouse=True)

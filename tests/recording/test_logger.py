@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermoctl.recording.logger import parsed_columns, read_recording
+from thermoctl.recording.foreign.logger import parsed_columns, read_recording
 from thermoctl.yamlfile import InputError
 
 T, X = [0.0, 1.0, 2.5], [21.5, np.nan, 1e-3]
@@ -131,7 +131,7 @@ def test_every_guess_is_said_aloud(tmp_path):
 
 
 def test_our_own_files_go_the_old_way(tmp_path, monkeypatch):
-    from thermoctl.recording import logger
+    from thermoctl.recording.foreign import logger
 
     monkeypatch.setattr(logger, "_sheets", lambda *_: 1 / 0)
     assert len(read_recording(written(tmp_path, "# c\nt,x\n0,1\n1,\n"))) == 2

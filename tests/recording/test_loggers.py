@@ -4,7 +4,7 @@ import pytest
 
 from tests.recording import loggers
 from thermoctl import cli
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 
 
 @pytest.mark.parametrize("case", loggers.CASES, ids=lambda c: c.logger)

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.yamlfile import InputError
 
 EXAMPLES = int(os.environ.get("THERMOCTL_READINGS", "60"))

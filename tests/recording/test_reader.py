@@ -12,7 +12,7 @@ from test_writer import feed, only, settings, ticks
 
 from thermoctl.cli import main
 from thermoctl.recording.files import read_table, write_table
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.reader import export, info, read_rows, recover
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter

@@ -27,7 +27,7 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.identify import experiments
 from thermoctl.plant import extended
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import INDEX, NAMES, POINTS
 

@@ -24,7 +24,7 @@ from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import filter, kernels
 from thermoctl.identify.experiments import Schedule
 from thermoctl.plant import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import POINTS
 

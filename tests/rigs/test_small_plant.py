@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.plant import load
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PLANT = Path(__file__).resolve().parents[2] / "config/examples/small.thermal.yaml"

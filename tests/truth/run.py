@@ -21,7 +21,7 @@ from thermoctl.diagnosis.threads import one_thread
 from thermoctl.fleet.jobs import Job, Run
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.yamlfile import InputError
 
 KEPT = "sought.pickle"

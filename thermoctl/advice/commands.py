@@ -18,7 +18,7 @@ from thermoctl.diagnosis.commands import parsed_limits
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import options
+from thermoctl.recording.foreign.logger import options
 from thermoctl.yamlfile import InputError
 
 

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE
 from thermoctl.diagnosis.hypothesis.effect import read
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import Plant, expression, load
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.plant.units import check_units
 from thermoctl.shipped import shipped
 from thermoctl.yamlfile import InputError, Node

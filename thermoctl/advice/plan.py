@@ -26,11 +26,11 @@ from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Range
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Plant
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import in_plant_units
-from thermoctl.plant.whitening import default_noise
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

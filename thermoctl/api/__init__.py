@@ -19,9 +19,9 @@ from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.results import Simulation, joined
 from thermoctl.checks import Finding, checks
 from thermoctl.plant import from_plain, load
-from thermoctl.plant.initial import last_state, with_start
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.simulation.initial import last_state, with_start
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

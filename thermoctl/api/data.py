@@ -12,9 +12,9 @@ import numpy as np
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import in_parts
 from thermoctl.plant.units import in_plant_units
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
+from thermoctl.recording.foreign.units import split_unit
 from thermoctl.recording.table import Table
-from thermoctl.recording.units import split_unit
 from thermoctl.yamlfile import InputError, suggest
 
 

@@ -24,7 +24,7 @@ from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis as Found
 from thermoctl.diagnosis.result import contract
 from thermoctl.plant import save
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.report.page import figure
 from thermoctl.safe_file import whole_files, write_text
 from thermoctl.yamlfile import InputError

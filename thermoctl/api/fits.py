@@ -10,9 +10,9 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import profile_curve, residual_panels
-from thermoctl.plant.estimate import Estimate, report, updated
-from thermoctl.plant.refit import Fit, fit
-from thermoctl.plant.simulate import Excitation, compile_plant
+from thermoctl.plant.fitting.estimate import Estimate, report, updated
+from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.simulation.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
 from thermoctl.yamlfile import InputError, suggest
 

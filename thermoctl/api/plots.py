@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, titled
 
 if TYPE_CHECKING:

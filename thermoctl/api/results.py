@@ -11,8 +11,8 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import over_time
-from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.simulate import Simulation as Run
+from thermoctl.plant.simulation.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Simulation as Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

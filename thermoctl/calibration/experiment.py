@@ -16,7 +16,7 @@ from thermoctl.calibration.recorded import as_table
 from thermoctl.configuration.settings import Settings
 from thermoctl.identify import experiments
 from thermoctl.plant import load
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import write_text

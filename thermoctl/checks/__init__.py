@@ -13,7 +13,7 @@ from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import label_findings
 from thermoctl.checks.model import plant_findings, start_findings
 from thermoctl.plant import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
 

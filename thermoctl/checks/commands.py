@@ -12,7 +12,7 @@ from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
 from thermoctl.plant import Plant, commands, load
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import options, print_notes
+from thermoctl.recording.foreign.logger import options, print_notes
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -12,11 +12,12 @@ from math import gcd, log
 import numpy as np
 
 from thermoctl.checks.finding import Finding
-from thermoctl.plant import Plant, refit
+from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
+from thermoctl.plant.fitting import refit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Input
-from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -25,10 +25,10 @@ from thermoctl.checks.data import driving_inputs, moves
 from thermoctl.checks.file import driving_away
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.model import NYQUIST, rates_of
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Input, Output, Plant
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import Model, SimulationError, compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.units import conversion, dimension
 

@@ -12,8 +12,8 @@ import numpy as np
 from thermoctl.checks.finding import Finding
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
-from thermoctl.plant.simulate import Excitation, Model, SimulationError
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.fitting.whitening import default_noise
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
 
 GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
 NYQUIST = np.pi  # sampling interval over time constant from which a mode lies beyond the Nyquist frequency

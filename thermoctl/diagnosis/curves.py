@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 
 
 @dataclass(frozen=True)

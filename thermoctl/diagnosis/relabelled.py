@@ -27,7 +27,7 @@ from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

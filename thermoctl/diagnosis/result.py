@@ -26,9 +26,9 @@ from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
 from thermoctl.plant import expression as ex
+from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 MOVES = 6.0  # of its noise: least spread of an output that moves
 FOLLOWS = (

@@ -31,7 +31,7 @@ from thermoctl.extras import lacking
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.report.page import page
 from thermoctl.safe_file import whole_files, write_text

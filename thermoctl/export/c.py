@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from thermoctl.export.values import Values, first_outputs
-from thermoctl.plant import compile as plant_compile
 from thermoctl.plant import expression as ex
-from thermoctl.plant.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
+from thermoctl.plant.simulation import compile as plant_compile
+from thermoctl.plant.simulation.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 
 _ESDIRK = Path(plant_compile.__file__).with_name("esdirk.h")
 _HERE = Path(__file__).parent

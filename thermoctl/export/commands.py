@@ -14,9 +14,9 @@ from thermoctl.export.modelica import modelica_source
 from thermoctl.export.python import python_source
 from thermoctl.export.values import values
 from thermoctl.plant import Plant, load
-from thermoctl.plant.equations import Equations
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.recording.logger import options
+from thermoctl.plant.simulation.equations import Equations
+from thermoctl.recording.foreign.logger import options
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError

@@ -19,9 +19,9 @@ from thermoctl import __version__
 from thermoctl.export.c import core, time_jumps
 from thermoctl.export.values import Values, first_outputs
 from thermoctl.plant import expression as ex
-from thermoctl.plant.build import compiler
-from thermoctl.plant.equations import Equations
 from thermoctl.plant.language import Plant
+from thermoctl.plant.native.build import compiler
+from thermoctl.plant.simulation.equations import Equations
 from thermoctl.safe_file import whole_file
 from thermoctl.units import conversion, dimension
 from thermoctl.yamlfile import InputError

@@ -7,9 +7,9 @@ import re
 from thermoctl import __version__
 from thermoctl.export.text import Notation, unique, written
 from thermoctl.export.values import Values, first_outputs
-from thermoctl.plant.equations import Equations
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Plant
+from thermoctl.plant.simulation.equations import Equations
 
 _FUNCTIONS = {f: f"{f}({{0}})" for f in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh")}
 

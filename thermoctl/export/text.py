@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
-from thermoctl.plant.equations import argument
 from thermoctl.plant.expression import Expr, num
 from thermoctl.plant.language import Plant
+from thermoctl.plant.simulation.equations import argument
 from thermoctl.yamlfile import InputError
 
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.equations import Equations
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.equations import Equations
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -17,9 +17,9 @@ from thermoctl.control import recorded_faults
 from thermoctl.control.arming import ARMED
 from thermoctl.fleet.recordings import local, rig_of
 from thermoctl.plant import load
-from thermoctl.plant.estimate import report
-from thermoctl.plant.refit import Fit, fit
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.fitting.estimate import report
+from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import join_fault_words

@@ -9,7 +9,7 @@ TABLE: Table = {
         command(
             "plant new",
             "write a first plant file: from a recording, from a template, or a template that reads a recording",
-            "thermoctl.plant.new:new",
+            "thermoctl.plant.first.new:new",
             "",
             argument("file", metavar="FILE", help="the plant file to write"),
             argument(

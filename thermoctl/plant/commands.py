@@ -14,16 +14,16 @@ from rich.table import Table as Grid
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
-from thermoctl.plant.ahead import ahead, all_uncertain
-from thermoctl.plant.estimate import Estimate, report, updated
-from thermoctl.plant.initial import last_state, with_start
-from thermoctl.plant.noise import coloured
+from thermoctl.plant.fitting.estimate import Estimate, report, updated
+from thermoctl.plant.fitting.noise import coloured
+from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.refit import Fit, fit
-from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.ahead import ahead, all_uncertain
+from thermoctl.plant.simulation.initial import last_state, with_start
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.plant.units import as_recorded
 from thermoctl.recording.files import write_table
-from thermoctl.recording.logger import options, print_notes
+from thermoctl.recording.foreign.logger import options, print_notes
 from thermoctl.recording.table import Table
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError

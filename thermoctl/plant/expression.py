@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.plant.fmu import opened
+from thermoctl.plant.native.fmu import opened
 
 FUNCTIONS = {
     "abs": 1,

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.plant.fmu import Fmu, Variable, opened
 from thermoctl.plant.language import FORMAT
+from thermoctl.plant.native.fmu import Fmu, Variable, opened
 from thermoctl.plant.parse import RESERVED
 from thermoctl.units import dimension
 from thermoctl.yamlfile import Node, suggest

@@ -11,7 +11,7 @@ from typing import Any
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import all_parts
 from thermoctl.plant.units import in_plant_units
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.table import Table
 
 

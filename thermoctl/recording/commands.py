@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.recording.files import write_table
-from thermoctl.recording.logger import joined, options, print_notes, read_recording
+from thermoctl.recording.foreign.logger import joined, options, print_notes, read_recording
 from thermoctl.recording.reader import export, info, recover
 from thermoctl.recording.writer import FULL, TIER, recording_files
 from thermoctl.yamlfile import InputError

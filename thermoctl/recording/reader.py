@@ -15,9 +15,9 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from thermoctl.recording import formats
 from thermoctl.recording.files import READERS, read_table, to_arrow
-from thermoctl.recording.logger import read_recording
+from thermoctl.recording.foreign import formats
+from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.stream import END, open_stream
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import of_recording

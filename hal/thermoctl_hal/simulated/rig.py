@@ -23,8 +23,8 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
-from thermoctl.plant.sensor import SlowError
-from thermoctl.plant.simulate import compile_plant
+from thermoctl.plant.simulation.sensor import SlowError
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample

@@ -21,11 +21,11 @@ from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.plant import expression as ex
-from thermoctl.plant.cores import give_back
+from thermoctl.plant.fitting.cores import give_back
+from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit, fit
-from thermoctl.plant.simulate import RTOL, Excitation, Model, compile_plant
-from thermoctl.plant.whitening import Noise
+from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

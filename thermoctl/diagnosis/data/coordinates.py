@@ -18,8 +18,8 @@ from functools import cache, lru_cache
 import numpy as np
 from scipy.fft import dct, idct
 
-from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.whitening import measured
+from thermoctl.plant.fitting.whitening import measured
+from thermoctl.plant.simulation.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # ratio of a band's ends: a quarter of an octave

@@ -36,13 +36,13 @@ from scipy.fft import dct
 from scipy.special import chdtri
 
 from thermoctl.diagnosis.data.coordinates import band_edges
-from thermoctl.plant.cores import each_of
+from thermoctl.plant.fitting.cores import each_of
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.fitting.whitening import Noise, default_noise
 from thermoctl.plant.language import Plant, SensorNoise
-from thermoctl.plant.refit import fit
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.plant.units import in_plant_units
-from thermoctl.plant.whitening import Noise, default_noise
 from thermoctl.recording.table import Table
 
 # None of these numbers chooses a hypothesis.

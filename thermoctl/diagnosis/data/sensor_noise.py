@@ -25,11 +25,11 @@ from scipy.optimize import minimize
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnosis.data.spectra import spectrum
 from thermoctl.plant import load, save
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.refit import fit
-from thermoctl.plant.simulate import compile_plant
-from thermoctl.plant.whitening import default_noise
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermoctl.diagnosis.evidence.posterior import Posterior
-from thermoctl.plant.residuals import Problem
+from thermoctl.plant.fitting.residuals import Problem
 
 EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is at its bound
 MOST = 0.9  # largest share of the curvature that the unknown spectrum may remove

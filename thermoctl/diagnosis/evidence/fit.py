@@ -26,13 +26,13 @@ from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
 from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
-from thermoctl.plant import refit
-from thermoctl.plant.climb import Climbed, bounded_step
-from thermoctl.plant.estimate import updated
+from thermoctl.plant.fitting import refit
+from thermoctl.plant.fitting.climb import Climbed, bounded_step
+from thermoctl.plant.fitting.estimate import updated
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.fitting.residuals import Evaluation, Problem
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.residuals import Evaluation, Problem
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 SIGNIFICANT = 2.0  # standard deviations
 UNIFORM = 12.0  # precision of a uniform prior over 0..1

@@ -12,9 +12,9 @@ from scipy.special import stdtr
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.plant import refit
+from thermoctl.plant.fitting import refit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ENOUGH = 3  # from this number of recordings on, the last one is set aside

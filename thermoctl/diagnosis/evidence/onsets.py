@@ -9,10 +9,10 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.posterior import Placed
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 TIMES = ("onset", "start", "end")  # shapes that are the time of a jump
 ONSETS = 24  # onset times of a screening's grid over the recordings

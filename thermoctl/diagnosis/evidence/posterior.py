@@ -2,7 +2,7 @@
 
     log p(z | D) = log p(D | z) + log p(z) + constant
 
-log p(D | z) is averaged over noise and remainder (noise.py). plant/climb.py finds its maximum; with the
+log p(D | z) is averaged over noise and remainder (noise.py). climb.py finds its maximum; with the
 weights E[1/V] the gradient is exact. Gradient and curvature are sums over recordings: one recording at a time
 is simulated, and its sums are added.
 """
@@ -20,10 +20,10 @@ from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
-from thermoctl.plant.climb import Climbed, Spot, climb
+from thermoctl.plant.fitting.climb import Climbed, Spot, climb
+from thermoctl.plant.fitting.residuals import HUGE, PROBE, Problem
 from thermoctl.plant.language import Plant
-from thermoctl.plant.residuals import HUGE, PROBE, Problem
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 ROUNDS = 40  # largest number of steps

@@ -20,7 +20,7 @@ from thermoctl.diagnosis.data.coordinates import Coordinates, band_edges, transf
 from thermoctl.diagnosis.data.spectra import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Flow, Plant
-from thermoctl.plant.simulate import Excitation, Model
+from thermoctl.plant.simulation.simulate import Excitation, Model
 
 SHARES = 10.0 ** np.arange(-3.5, 1.1, 0.5)  # values of eta: rms of a force over the typical flow
 CORNERS = 3  # number of values of tau, from a fortieth to a quarter of the longest recording

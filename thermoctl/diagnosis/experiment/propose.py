@@ -32,8 +32,8 @@ from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.law.result import described
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.plant.residuals import Scale
-from thermoctl.plant.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.fitting.residuals import Scale
+from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 

@@ -14,8 +14,8 @@ from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, askable
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.fitting.residuals import Prior
 from thermoctl.plant.language import Plant
-from thermoctl.plant.residuals import Prior
 
 Key = tuple[str, str]  # (effect, where)
 

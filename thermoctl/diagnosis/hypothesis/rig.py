@@ -15,7 +15,7 @@ from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 from thermoctl.units import dimension
 
 if TYPE_CHECKING:
-    from thermoctl.plant.simulate import Excitation
+    from thermoctl.plant.simulation.simulate import Excitation
 
 SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
 STRAIGHT = "_straight"  # of the name of an input that holds, where it goes on straight lines

@@ -16,7 +16,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Input, Node, Output, Plant
 
 if TYPE_CHECKING:
-    from thermoctl.plant.simulate import Excitation
+    from thermoctl.plant.simulation.simulate import Excitation
 
 RATES = ("", "velocity", "rotation", "voltage")  # kinds that a velocity by structure may have
 PLACES = ("", "length", "voltage")  # kinds that its position may have

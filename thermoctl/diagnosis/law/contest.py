@@ -21,7 +21,7 @@ from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.propose import Proposal, propose_laws
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 
 def with_laws(

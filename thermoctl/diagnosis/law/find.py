@@ -23,7 +23,7 @@ from thermoctl.diagnosis.law.refit import (
 from thermoctl.diagnosis.law.smooth import law_unit, tracked
 from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
-from thermoctl.plant.cores import LEAST, batches, each
+from thermoctl.plant.fitting.cores import LEAST, batches, each
 
 Tried = tuple[Proposal, Fitted]
 

@@ -21,7 +21,7 @@ from thermoctl.diagnosis.law.forms import Family, Term, combined, families, libr
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.search.shortlist import ALIKE
-from thermoctl.plant.residuals import HUGE
+from thermoctl.plant.fitting.residuals import HUGE
 
 PIECES = 8  # of a free function of a signal
 TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each

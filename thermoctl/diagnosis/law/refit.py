@@ -18,7 +18,7 @@ from thermoctl.diagnosis.law.forms import law_effect, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.plant import expression as ex
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.yamlfile import InputError
 
 FEWEST_REFITS = 3  # of a plant of many bodies, see NUMBERS

@@ -29,7 +29,7 @@ from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.language import Flow, Input, Plant
-from thermoctl.plant.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 LATENT = "unknown_flow_into_"
 KNOTS = 240  # of a recording, shared among the nodes

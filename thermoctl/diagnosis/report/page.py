@@ -20,8 +20,8 @@ from thermoctl.diagnosis.report.figures import Output, Rows, chance, outputs
 from thermoctl.diagnosis.report.plots import BROAD, NARROW, compared, remaining
 from thermoctl.diagnosis.report.words import listed, name, sentences, what_next
 from thermoctl.diagnosis.result import Diagnosis, curves
-from thermoctl.plant.estimate import Estimate, correlations, report
-from thermoctl.plant.refit import Fit
+from thermoctl.plant.fitting.estimate import Estimate, correlations, report
+from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, folded, page, sheet, table, unit
 from thermoctl.safe_file import write_text

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor. A
 # second refit starts there, because an axis that sticks rests for a long time.

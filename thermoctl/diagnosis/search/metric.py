@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.simulate import Excitation, Model, Simulation
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.simulation.simulate import Excitation, Model, Simulation
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.rig import CORRECT, SEEN
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Flow, Input, Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.whitening import Noise
+from thermoctl.plant.simulation.simulate import Excitation
 
 LASTING = 20.0  # correlation time of a missing flow in samples: intensity of the noise over its variance
 RESTING = 1e-3  # least slope of a state over that of the fastest one, so that every state has process noise

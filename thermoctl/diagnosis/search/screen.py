@@ -29,7 +29,7 @@ from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values
 from thermoctl.diagnosis.search.metric import Metric, Pushed
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.diagnosis.search.shapes import shape_grid
-from thermoctl.plant.cores import ABREAST, LEAST, each
+from thermoctl.plant.fitting.cores import ABREAST, LEAST, each
 
 EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
 CHUNK = 96

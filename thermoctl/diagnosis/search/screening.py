@@ -21,8 +21,8 @@ from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Absorbed, Metric, Pushed, without
 from thermoctl.diagnosis.search.screen import Norms, screen
 from thermoctl.diagnosis.search.sketch import likeliest
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import Simulation
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.simulation.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
 FREE = 1e4  # standard deviation that stands for no prior

@@ -9,7 +9,7 @@ import numpy as np
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
-from thermoctl.plant.simulate import Simulation
+from thermoctl.plant.simulation.simulate import Simulation
 
 REPEATED = 2.0  # least number of periods over the span of the signal
 BEYOND = 1 / 3, 2 / 3  # levels above the last quantile: shares of the way to the extreme

@@ -31,8 +31,8 @@ from thermoctl.diagnosis.evidence.posterior import Posterior, gaussian
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.search.beam import Keys
 from thermoctl.diagnosis.verdict.decide import Probabilities
-from thermoctl.plant.climb import bounded_step
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.fitting.climb import bounded_step
+from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 
 BLOCKS = 8  # parts of each recording

@@ -30,7 +30,7 @@ from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 # Knots of a recording, at most and at least, and about how many in all recordings together.
 KNOTS, FEWEST, TOGETHER = 24, 6, 240

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import ZERO, Expr, add, derivative, div, name, neg
-from thermoctl.plant.fmu import opened, used
 from thermoctl.plant.language import Plant
+from thermoctl.plant.native.fmu import opened, used
 from thermoctl.yamlfile import InputError
 
 _JUMPS = ("step", "sign", ">", ">=", "<", "<=", "bump")

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from thermoctl.recording.clock import Seconds
+from thermoctl.recording.foreign.clock import Seconds
 
 Cells: TypeAlias = np.ndarray | pa.Array
 """A column: float64, datetime64 or timedelta64 values, or texts."""

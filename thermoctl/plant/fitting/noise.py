@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.residuals import Problem
-from thermoctl.plant.simulate import Excitation
-from thermoctl.plant.whitening import Noise
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.fitting.whitening import Noise
+from thermoctl.plant.simulation.simulate import Excitation
 
 CLIP = 6.0  # residuals are clipped to this many robust standard deviations
 # limits of the correlation of neighbouring samples; below the first: white noise

@@ -18,7 +18,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from thermoctl.plant.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e8  # damping: the first, and its limits
 EASED, RAISED = 0.2, 8.0  # factor on the damping after a step that gains half of its promise; after a failure

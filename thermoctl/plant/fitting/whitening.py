@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 
 MIN_DIFFERENCED = 4  # fewest samples of a recording for second differences
 

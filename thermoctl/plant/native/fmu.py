@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoctl.extras import load
-from thermoctl.plant.build import compiler, library
+from thermoctl.plant.native.build import compiler, library
 from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermoctl.plant.climb import Climbed, Spot, climb
-from thermoctl.plant.residuals import Evaluation, Prior, Problem, ResidualRows
-from thermoctl.plant.simulate import Excitation, Model, SimulationError
-from thermoctl.plant.whitening import Noise, default_noise
+from thermoctl.plant.fitting.climb import Climbed, Spot, climb
+from thermoctl.plant.fitting.residuals import Evaluation, Prior, Problem, ResidualRows
+from thermoctl.plant.fitting.whitening import Noise, default_noise
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
 
 AT_BOUND = 1e-6  # a parameter counts as at its bound within this share of its range
 MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations

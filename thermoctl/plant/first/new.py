@@ -10,9 +10,9 @@ from thermoctl.plant.files import loads
 from thermoctl.plant.first import motion, tanks, template, thermal
 from thermoctl.plant.first.columns import COLDEST, HOTTEST, Column, quoted, recognise
 from thermoctl.plant.first.template import TEMPLATES
-from thermoctl.recording.logger import options, print_notes, read_recording
+from thermoctl.recording.foreign.logger import options, print_notes, read_recording
+from thermoctl.recording.foreign.units import split_unit
 from thermoctl.recording.table import Table
-from thermoctl.recording.units import split_unit
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError, suggest
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation, Model
+from thermoctl.plant.simulation.simulate import Excitation, Model
 
 RENEWAL = 0.1  # largest error of a state, as a share of its range, allowed at the start of a block
 RECENT = 0.25  # share of a block from which its data count in full; older ones fade exponentially

@@ -21,11 +21,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.build import library
-from thermoctl.plant.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 from thermoctl.plant.expression import ZERO, Expr, add, derivative, mul, name
-from thermoctl.plant.fmu import opened
 from thermoctl.plant.language import Plant
+from thermoctl.plant.native.build import library
+from thermoctl.plant.native.fmu import opened
+from thermoctl.plant.simulation.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 
 _HEADERS = tuple(Path(__file__).with_name(h) for h in ("esdirk.h", "integrator.h"))
 _LOCK = threading.Lock()

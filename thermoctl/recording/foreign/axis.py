@@ -14,10 +14,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from thermoctl.recording import clock
-from thermoctl.recording.clock import ClockError, Seconds
-from thermoctl.recording.sheet import Cells, Sheet
-from thermoctl.recording.units import WORDS, known, spelled
+from thermoctl.recording.foreign import clock
+from thermoctl.recording.foreign.clock import ClockError, Seconds
+from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.units import WORDS, known, spelled
 from thermoctl.units import SECONDS
 
 KINDS = {

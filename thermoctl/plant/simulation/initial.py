@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.ahead import ahead, all_uncertain
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulate import Excitation, Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.ahead import ahead, all_uncertain
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest
 

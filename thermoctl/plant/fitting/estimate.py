@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.plant.fitting.refit import Fit
+from thermoctl.plant.fitting.residuals import PRIOR_WEIGHT, Scale
 from thermoctl.plant.language import Plant
-from thermoctl.plant.refit import Fit
-from thermoctl.plant.residuals import PRIOR_WEIGHT, Scale
-from thermoctl.plant.simulate import Excitation
+from thermoctl.plant.simulation.simulate import Excitation
 
 DEAD = 0.1  # `dead`: a parameter's whole range changes the residuals by fewer standard deviations
 FLAT = 0.5  # `flat`: a parameter's standard error exceeds this share of its range

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from thermoctl.plant import expression as ex
-from thermoctl.plant.compile import Code, machine_code
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
-from thermoctl.plant.sensor import error
+from thermoctl.plant.simulation.compile import Code, machine_code
+from thermoctl.plant.simulation.sensor import error
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError, suggest

@@ -20,10 +20,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from thermoctl.extras import load
-from thermoctl.recording.clock import Seconds
-from thermoctl.recording.sheet import Cells, Sheet
+from thermoctl.recording.foreign.clock import Seconds
+from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table
-from thermoctl.recording.units import spelled
 from thermoctl.rig.signals import units
 from thermoctl.yamlfile import InputError, suggest
 

@@ -25,11 +25,12 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from thermoctl.recording import axis, cells, clock, files, formats, layouts
-from thermoctl.recording.axis import Clock
-from thermoctl.recording.cells import CellError
-from thermoctl.recording.clock import ClockError
-from thermoctl.recording.dialect import (
+from thermoctl.recording import files
+from thermoctl.recording.foreign import axis, cells, clock, formats, layouts
+from thermoctl.recording.foreign.axis import Clock
+from thermoctl.recording.foreign.cells import CellError
+from thermoctl.recording.foreign.clock import ClockError
+from thermoctl.recording.foreign.dialect import (
     FACT,
     Dialect,
     cells_of,
@@ -39,9 +40,9 @@ from thermoctl.recording.dialect import (
     lines,
     stated_step,
 )
-from thermoctl.recording.sheet import Cells, Sheet
+from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.units import split_unit, split_words
 from thermoctl.recording.table import Table
-from thermoctl.recording.units import split_unit, split_words
 from thermoctl.yamlfile import InputError, suggest
 
 HEAD = 65536  # bytes that decide whether a file is one of ours

@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from thermoctl.recording.axis import is_generic, named
-from thermoctl.recording.cells import is_missing, is_number
-from thermoctl.recording.clock import is_time
-from thermoctl.recording.units import WORDS, known, spelled, split_unit, split_words
+from thermoctl.recording.foreign.axis import is_generic, named
+from thermoctl.recording.foreign.cells import is_missing, is_number
+from thermoctl.recording.foreign.clock import is_time
+from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
 from thermoctl.units import SECONDS
 from thermoctl.yamlfile import InputError
 

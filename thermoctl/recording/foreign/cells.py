@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from thermoctl.recording.units import WORDS, known, scale_between, spelled
+from thermoctl.recording.foreign.units import WORDS, known, scale_between, spelled
 
 MISSING = frozenset({"", *(w.strip() for w in WORDS["missing"].split("|"))})
 """Cells that mean "no value", in lower case."""

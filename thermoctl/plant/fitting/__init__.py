@@ -1,0 +1,1 @@
+"""Plants beside recordings: residuals and their slopes, refit, estimated inputs, noise."""

@@ -1,0 +1,1 @@
+"""Recordings of other programs and loggers: their clock, layout, units and numbers."""
