@@ -1,4 +1,4 @@
-"""The diagnosis as one object, and as the JSON of its contract (thermoctl-diagnosis/1)."""
+"""The diagnosis as one object, and as the content of diagnosis.json (format thermoctl-diagnosis/1)."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
-MOVES = 6.0  # of its noise: least spread of an output that moves
+MOVES = 6.0  # an output moves if its spread is this many standard deviations of its noise
 FOLLOWS = (
-    0.3  # of an output's variance: most that a plant of the right rig leaves, even where it lacks physics
+    0.3  # largest residual variance over the output's, if the plant is of this rig and lacks some physics
 )
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
@@ -40,23 +40,22 @@ UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitt
 BLOCKS, LARGE = (
     40,
     1.5,
-)  # of a recording; a block's rms over that of the recording, from which its misfit is large
+)  # number of blocks of a recording; least rms of a block with a large error, over that of the recording
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found.
+    """The outcome of a diagnosis.
 
-    - `best`: the leading hypothesis; `null`: the plant without any effect, after an ordinary refit
+    - `best`: the leading hypothesis; `null`: the plant without any effect, refitted in white noise
     - `left`, `before`: the residual of `best` and of `null`
-    - `energy`: of each hypothesis' residuals
-    - `physics`: for hypotheses of which an effect stands out of the misfit that they leave: each effect's
-      probability of being physics
-    - `unknown`: a sentence on physics that no output shows alone; empty where it is not likely
-    - `asked`: probability that an effect predicts what it was not fitted to, of those that would be named
-    - `families`: effects that imitate each other, one of which is sure
-    - `missing_flow`: rms of the flow into `before.node` that would close the misfit, where nothing is shown
-    - `law`: a law among the findings"""
+    - `energy`: energies of each hypothesis' residuals (verdict/misfit.py)
+    - `physics`: result of `misfit.standing`: each effect's probability of being physics, by hypothesis
+    - `unknown`: a sentence on a missing flow that no output shows alone; empty where it is not likely
+    - `asked`: for the effects that were tested (verdict/confirm.py), the probability that they are confirmed
+    - `families`: effects that imitate each other, of which one is certain (verdict/families.py)
+    - `missing_flow`: if nothing is found, the rms of the flow into `before.node` with which the plant fits
+    - `law`: the law among the findings, if any"""
 
     case: Case
     searched: Searched
@@ -77,7 +76,7 @@ class Diagnosis:
 
     @property
     def shown(self) -> tuple[Placed, ...]:
-        """The effects that the result reports as findings."""
+        """Return the effects that the result reports as findings."""
         effects = [e for e in self.best.hypothesis.effects if not isinstance(e, PlacedLaw)]
         if self.decision.verdict == "ambiguous":
             return tuple(effects)
@@ -85,27 +84,27 @@ class Diagnosis:
 
     @property
     def refused(self) -> frozenset[Key]:
-        """Return the effects that would be named, and that nothing else confirms."""
+        """Return the effects that are not named because other data do not confirm them."""
         return frozenset(self.asked) - {*self.decision.named}
 
     @property
     def extends(self) -> bool:
-        """Return whether the outcome is the plant with something that it lacked."""
+        """Return whether the outcome has an effect or a law more than the original plant."""
         return bool(self.shown) or self.law is not None
 
     @property
     def final(self) -> Fitted:
-        """The hypothesis that the result shows as the outcome."""
+        """Return the hypothesis that the result shows: `best` if it extends the plant, else `null`."""
         return self.best if self.extends else self.null
 
     @property
     def remainder(self) -> Left:
-        """The residual of the outcome."""
+        """Return the residual of the hypothesis `final`."""
         return self.left if self.extends else self.before
 
     @cached_property
     def came(self) -> list[np.ndarray] | None:
-        """Errors (N, outputs) of the plant as its file has it; None if it cannot be simulated."""
+        """Errors (N, outputs), by recording, of the plant as given; None if it cannot be simulated."""
         model = compile_plant(self.case.plant)
         try:
             return [x.y - model.run(x).y for x in self.case.drives(model)]
@@ -114,7 +113,7 @@ class Diagnosis:
 
     @property
     def extended(self) -> Plant:
-        """The plant with the findings and the law, refitted."""
+        """Return the refitted plant with the findings and the law."""
         return self.final.plant
 
 
@@ -130,7 +129,7 @@ def curves(d: Diagnosis) -> list[Curve]:
 
 
 def contract(d: Diagnosis) -> dict[str, Any]:
-    """Return thermoctl-diagnosis/1; `next_experiment`, `not_seen` and `seconds` are still empty."""
+    """Return the content of diagnosis.json, with `next_experiment`, `not_seen` and `seconds` still empty."""
     keys = {e.key for e in d.shown}
     stays = d.law is not None or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
     outputs = d.case.plant.outputs
@@ -220,7 +219,7 @@ def _notes(d: Diagnosis) -> list[str]:
 
 
 def unfinished(*fits: Fitted) -> list[str]:
-    """Return a sentence for each hypothesis whose refit ended by its limit, below its maximum."""
+    """Return a sentence for each fit that the limit of steps ended below its maximum."""
     names = {
         ", ".join(f"{e} at {at}" for e, at in sorted(f.hypothesis.keys)) or "the plant without effects": f.fit
         for f in fits
@@ -238,7 +237,7 @@ def unfinished(*fits: Fitted) -> list[str]:
 
 
 def doubts(case: Case, fit: Fit, noise: Mapping[str, float]) -> list[str]:
-    """Return doubts that the recordings suit the plant: nothing moves, or the errors are very large."""
+    """Return sentences that doubt the recordings: nothing moves, or they do not suit the plant."""
     model = fit.model
     drives = case.drives(model)
     recorded = np.concatenate([x.y for x in drives])
@@ -288,7 +287,7 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
 
 
 def _equation(after: Plant, e: Placed) -> str:
-    """Return the expression that the effect brings or changes."""
+    """Return the expression that the effect adds or changes, as text."""
     mine = set(e.own.values())
     for f in reversed(list(after.flows.values())):
         if ex.names(f.rate) & mine:
@@ -334,7 +333,7 @@ def _when(d: Diagnosis, output: str) -> list[list[float]]:
     errors = [e[:, j] for e in d.null.fit.residuals]
     sizes = [float(np.nanmean(e**2)) if np.isfinite(e).any() else 0.0 for e in errors]
     r = int(np.argmax(sizes))
-    # the samples are about evenly spaced, so that a block of samples is a block of time
+    # samples are about evenly spaced, so that blocks of samples have about the same duration
     edges = np.linspace(0, len(errors[r]), min(BLOCKS, len(errors[r])) + 1).astype(int)
     t = d.case.tables[r].t - d.case.tables[r].t[0]
     out: list[list[float]] = []
@@ -365,7 +364,7 @@ def _as_it_came(d: Diagnosis) -> dict[str, float]:
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
     """Return every hypothesis that was fitted, the likeliest first.
 
-    `physics`: each effect's probability to be no unnamed misfit; null where none stands out of it.
+    `physics`: each effect's probability of being physics; null if none stands out of the misfit.
     `remainder`: the largest probability of a remainder at an output."""
     tried = d.searched.tried
     null = next(w.fitted.log_evidence for w in tried if not w.fitted.hypothesis.effects)
@@ -391,11 +390,12 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "dims": [len(e.own) for e in sorted(w.fitted.hypothesis.effects, key=lambda e: e.key)],
             }
         )
-    return sorted(out, key=lambda h: -h["posterior"])  # the order of scores stays among the unlikely
+    # The sort is stable: among equals the order of scores stays.
+    return sorted(out, key=lambda h: -h["posterior"])
 
 
 def _lost(d: Diagnosis) -> list[dict[str, Any]]:
-    """Return the fitted effects that are no finding, each in its best hypothesis, with the reason."""
+    """Return the fitted effects that are not findings, each in its best hypothesis, with the reason."""
     out: dict[Key, dict[str, Any]] = {}
     shown = {e.key for e in d.shown}
     final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)

@@ -22,7 +22,7 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits as numbers
 from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.report.page import write_report
-from thermoctl.diagnosis.report.trend import earlier_trends, told, trends
+from thermoctl.diagnosis.report.trend import earlier_trends, trend_notes, trends
 from thermoctl.diagnosis.report.unseen import not_seen
 from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis, contract
@@ -92,7 +92,7 @@ def diagnose(
     result = contract(found)
     result["next_experiment"] = proposed[0] if proposed else None
     result["trends"] = trends(found.case, found.best, found.shown, sizes)
-    result["notes"] += told(result["trends"])
+    result["notes"] += trend_notes(result["trends"])
     if before.recordings:
         result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")
     if stopped():

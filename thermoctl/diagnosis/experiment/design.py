@@ -1,9 +1,9 @@
 """The candidate experiments: the inputs that can be driven, and how, inside the rig's limits.
 
-The family: levels, steps both ways, warm-up and cool-down, trapezoids slow and fast, triangles small and
-large, and pseudo-random sequences of two bands. Every input is driven by itself and all together, in several
-lengths and from several starts. Inputs stay inside the range, and below the speed, that was recorded, unless
-limits are given."""
+The candidates are levels, steps both ways, warm-up and cool-down, slow and fast trapezoids, small and large
+triangles, and pseudo-random sequences of two bands. Each input is driven alone, then all together, with
+several durations and initial conditions. Inputs stay inside the recorded range, unless limits are given, and
+change no faster than was recorded."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from thermoctl.recording.table import Table
 from thermoctl.units import dimension
 from thermoctl.yamlfile import InputError
 
-TOGETHER = 0.98  # correlation from which two inputs count as one lever (voltage and current)
-SURROUNDINGS = ("K", "W/m^2", "Pa")  # dimensions of temperature, sunshine and pressure: nobody commands these
-LENGTHS = (1.0, 0.5, 2.0)  # of an experiment, in recordings' lengths
-STARTS_APART = 0.05  # share by which a constant input differs between recordings that count as two starts
+TOGETHER = 0.98  # correlation from which two inputs count as one lever, such as voltage and current
+# Dimensions of temperature, sunshine and pressure: these cannot be commanded.
+SURROUNDINGS = ("K", "W/m^2", "Pa")
+LENGTHS = (1.0, 0.5, 2.0)  # durations of experiments, over the median duration of the recordings
+STARTS_APART = 0.05  # relative difference of an input, constant in each recording, that makes two starts
 
 Ranges = Mapping[str, tuple[float, float]]
 NONE: Ranges = {}
@@ -31,23 +32,23 @@ Plateaus = list[tuple[float, float]]  # (duration in s, value) of each plateau
 
 @dataclass(frozen=True)
 class Lever:
-    """An input that can be driven, and those that move with it: {input: (factor, offset)}.
+    """An input that can be driven, with its limits and its value at rest.
 
-    Also its limits and its value at rest."""
+    `moves`: the inputs that move with it, itself too, each as factor * value + offset."""
 
     name: str
     moves: Mapping[str, tuple[float, float]]
     low: float
     high: float
     rest: float
-    rate: float  # most it was seen to change in a second
+    rate: float  # largest recorded change in a second
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """The inputs of an experiment: corners (K, 2) of seconds and value, on straight lines.
+    """The inputs of an experiment: by input, corners (K, 2) of (s, value), with straight lines between.
 
-    `starts` are constant inputs."""
+    `starts`: values of the constant inputs."""
 
     title: str
     duration_s: float
@@ -55,7 +56,7 @@ class Excitation:
     starts: Mapping[str, float]
 
     def table(self, plant: Plant, step_s: float, name: str = "next_experiment") -> Table:
-        """Tabulate the inputs every `step_s`, by their columns."""
+        """Return the inputs at every `step_s` as a table, by their column names."""
         t = np.arange(int(np.floor(self.duration_s / step_s + 1e-9)) + 1) * step_s
         columns = {plant.inputs[n].column: np.interp(t, c[:, 0], c[:, 1]) for n, c in self.corners.items()}
         columns |= {
@@ -70,10 +71,9 @@ def levers(
 ) -> list[Lever]:
     """Find the inputs that moved in the recordings and can be commanded.
 
-    Inputs that moved together are one lever.
-
-    Temperatures, sunshine and pressure belong to the surroundings. `only`: names that count, in any
-    unit. `limits`: by input, instead of the recorded range. Raises InputError for an unknown name."""
+    Inputs that moved together are one lever. Temperatures, sunshine and pressure belong to the surroundings
+    and are left out, unless `only` names them. `only`: the inputs that may be driven. `limits`: by input, a
+    range instead of the recorded one. Raises InputError for an unknown name."""
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
@@ -124,21 +124,21 @@ def _lever(name: str, column: str, tables: Sequence[Table], limits: Ranges) -> L
 
 
 def _ramps(lever: Lever, plateaus: Plateaus, step_s: float) -> np.ndarray:
-    """Corners (K, 2) of plateaus one after the other.
+    """Return the corners (K, 2) of consecutive plateaus.
 
     The ramps between them are no faster than was recorded."""
     corners = [(0.0, lever.rest)]
     for seconds, value in plateaus:
         t, now = corners[-1]
         ramp = max(abs(value - now) / max(lever.rate, 1e-300), 1e-3 * step_s)
-        if ramp > seconds:  # too slow to get there in time
+        if ramp > seconds:  # the plateau cannot be reached in its duration
             ramp, value = seconds, now + (value - now) * seconds / ramp
         corners += [(t + ramp, value), (t + seconds, value)]
     return np.array([c for k, c in enumerate(corners) if k == 0 or c[0] > corners[k - 1][0]])
 
 
 def _pseudo_random(lever: Lever, hold_s: float, duration_s: float, seed: int) -> Plateaus:
-    """Levels of `hold_s` or a multiple, from a shift register of maximum length (7 bits)."""
+    """Return levels held for `hold_s` or a multiple, from a 7-bit shift register of maximum length."""
     low, high = lever.low, lever.high
     levels = (low, high, high, 0.5 * (low + high), low, low + 0.75 * (high - low), low, high)
     state, out = 0b1010011 + 17 * seed, []
@@ -154,7 +154,7 @@ def _swings(low: float, high: float, period_s: float, duration_s: float) -> Plat
 
 
 def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> dict[str, np.ndarray]:
-    """List the family for one lever: {its course in words: corners (K, 2)}."""
+    """Return the courses of one lever: {description: corners (K, 2)}."""
     low, high, T = lever.low, lever.high, duration_s
     middle, span = 0.5 * (low + high), high - low
     away = high if high - lever.rest >= lever.rest - low else low
@@ -183,9 +183,7 @@ def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> di
 
 
 def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s: float) -> list[Excitation]:
-    """List the candidates.
-
-    Every lever by itself, the others at rest, and all together, over each of LENGTHS."""
+    """Return the candidates: each lever alone, the others at rest, and all together; at each of LENGTHS."""
     usual = float(np.median([t.t[-1] - t.t[0] for t in tables]))
     constant, starts = _constant(plant, tables, {n for lever in found for n in lever.moves})
     out = []
@@ -208,7 +206,7 @@ def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s
 def _plans(
     found: Sequence[Lever], duration_s: float, step_s: float
 ) -> list[tuple[str, dict[str, np.ndarray]]]:
-    """(title, {lever: corners}) of every course over one length."""
+    """Return (title, {lever: corners}) of every candidate of one duration."""
     rest = {lever.name: np.array([[0.0, lever.rest], [duration_s, lever.rest]]) for lever in found}
     plans = [
         (f"{lever.name} {words}", rest | {lever.name: c})
@@ -225,9 +223,10 @@ def _plans(
 def _constant(
     plant: Plant, tables: Sequence[Table], moved: set[str]
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
-    """Return the value of each input that is not driven (its mean), and the starting conditions.
+    """Return the mean of each input that is not driven, and the initial conditions to try.
 
-    An input that is constant in each recording but differs between recordings gives two starts."""
+    An input in an initial state that is constant in each recording, and differs between recordings, gives
+    two: its smallest and its largest value."""
     constant, low, high = {}, {}, {}
     for i in plant.inputs.values():
         if i.name in moved:

@@ -1,6 +1,4 @@
-"""The proposed experiment as files.
-
-One that `thermoctl experiment` runs, and its inputs over time for a person."""
+"""The proposed experiment as files: one for `thermoctl experiment`, and a table of its inputs."""
 
 from __future__ import annotations
 
@@ -19,15 +17,15 @@ from thermoctl.safe_file import write_text
 
 FORMAT = "thermoctl-experiments/1"
 FILES = ("next_experiment.yaml", "next_experiment.csv")
-SETPOINT = "setpoint_um"  # commanded by the daemon; the current of a flexure's actuator follows it
-ROWS = 20_000  # of the table for a person, at most
-FEWEST = 10  # samples from which a line of an input over the setpoint is fitted
+SETPOINT = "setpoint_um"  # the daemon commands it; the current of a flexure's actuator follows it
+ROWS = 20_000  # largest number of rows in the table for a person
+FEWEST = 10  # least number of samples to fit a straight line of an input over the setpoint
 
 
 def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation) -> list[str]:
     """Write FILES into a folder; return their names.
 
-    On the program's own rig it is the setpoint that is driven."""
+    On a rig that this program controls, the experiment commands the setpoint."""
     plant = case.plant
     driven = {plant.inputs[n].column: (plant.inputs[n].unit, c) for n, c in chosen.corners.items()}
     if (corners := _as_setpoint(case, chosen)) is not None:

@@ -1,8 +1,8 @@
-"""The experiment that decides between the hypotheses left, best per hour of rig time.
+"""The experiment that decides between the remaining hypotheses, the best for an hour of rig time.
 
-Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. The uncertainty left in their
-parameters counts against them (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983) 225), with R the noise's
-covariance, J = dy/dz, P = cov z:
+Two fitted hypotheses a, b predict readings y_a, y_b (N,) of an experiment. Their difference is compared with
+the noise and with the uncertainty of their parameters (Buzzi-Ferraris & Forzatti, Chem. Eng. Sci. 38 (1983)
+225). R is the noise's covariance, J = dy/dz, P = cov z:
 
     D_ab = (y_a - y_b)' (R + J_a P_a J_a' + J_b P_b J_b')^-1 (y_a - y_b)          (1)
 
@@ -11,8 +11,8 @@ The experiment's information on which hypothesis is true, in bits (lower bound o
 
     I = -sum_a w_a log2 sum_b w_b exp(-D_ab / 8)                                  (2)
 
-Chosen is the most I per hour among those that reach ENOUGH of the best I. Every reading, as every hypothesis
-predicts it, stays inside its recorded range, unless limits are given. Where no candidate stays inside, the
+The choice is the largest I per hour among the candidates that reach ENOUGH of the best I. Every hypothesis
+must predict every reading inside its recorded range, unless limits are given. If no candidate meets that, the
 inputs' excursions are made smaller (SHARES)."""
 
 from __future__ import annotations
@@ -37,24 +37,26 @@ from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_
 from thermoctl.recording.table import Table
 from thermoctl.yamlfile import InputError
 
-MOST = 5  # hypotheses that are compared
+MOST = 5  # largest number of hypotheses that are compared
 LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time
-POINTS, READINGS = 700, 4000  # of a simulated experiment, at most; thinned readings count as less noisy ones
-FEWEST_POINTS = 150  # of a simulated experiment, however many outputs it has
-TRIALS, FEWEST_TRIALS = 150, 40  # candidates that are simulated, at most; of more, evenly chosen ones
-NUMBERS = 2e8  # slopes that all trials compute, at most: a plant of many bodies gets fewer trials
-ENOUGH = 0.8  # of the best experiment's bits that a shorter one must reach
+# Largest number of samples and of readings of a simulated experiment. A sample that stands for several
+# recorded ones has a smaller noise.
+POINTS, READINGS = 700, 4000
+FEWEST_POINTS = 150  # least number of samples of a simulated experiment with many outputs
+TRIALS, FEWEST_TRIALS = 150, 40  # number of candidates that are simulated: at most, and for large plants
+NUMBERS = 2e8  # largest number of slopes that all trials compute: a plant of many bodies gets fewer trials
+ENOUGH = 0.8  # share of the best experiment's bits that a shorter one must reach
 SHARES = (
     1.0,
     0.7,
     0.5,
     0.3,
-)  # of the inputs' recorded excursion from rest: the largest that keeps readings inside
-DECIDES = 20.0  # D that decides: mean odds of e^(D/2) for one of two
+)  # shares of the inputs' recorded excursion from rest, tried until the readings stay inside their range
+DECIDES = 20.0  # least D that decides between two hypotheses: mean odds of e^(D/2)
 IN_RANGE = (
     0.09  # variance of a parameter that is new in every recording: anything within its range (z from 0 to 1)
 )
-WORTH_A_SENSOR = 0.1  # bits by which a further sensor must better the experiment
+WORTH_A_SENSOR = 0.1  # least information in bits that a further sensor must add to be proposed
 
 Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
 Prediction = tuple[np.ndarray, np.ndarray]  # readings (N, ny), and their uncertainty (N, ny, z)
@@ -68,10 +70,10 @@ class _Predictor:
     weight: float
     model: Model
     root: np.ndarray  # (z, z), P = root root'
-    slopes: np.ndarray  # dq / dz of the model's uncertain unknowns, else 0
+    slopes: np.ndarray  # (z,) dq / dz of each uncertain unknown, else 0
 
     def predict(self, table: Table, states: bool = False) -> Prediction | None:
-        """Simulate an experiment; None where that fails. With `states`, these follow the readings."""
+        """Simulate an experiment; None where that fails. `states`: append them as columns."""
         try:
             run = self.model.run(self.model.excitation(table), sensitivities=True, rtol=1e-5, states=states)
         except (SimulationError, InputError):
@@ -139,12 +141,10 @@ def bits(D: np.ndarray, weights: np.ndarray) -> float:
 
 
 def noise_of(case: Case, f: Fitted) -> np.ndarray:
-    """Estimate the uncertainty of one reading, per output (ny,).
+    """Return the standard deviation (ny,) of one reading of each output, for comparing hypotheses.
 
-    Rms residual of the likeliest hypothesis, at least the sensor's noise.
-
-    It is widened for the correlation of neighbours, whose mean tells less than that of independent
-    readings."""
+    It is the rms residual of the likeliest hypothesis, at least the sensor's noise. It is larger if
+    neighbouring residuals correlate, because their mean is less precise than that of independent ones."""
     out = []
     for o, n in zip(case.null.model.outputs, case.noise, strict=True):
         j = f.fit.model.outputs.index(o)
@@ -162,11 +162,10 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
 
 
 def survivors(found: Diagnosis) -> list[Standing]:
-    """List what is not ruled out, likeliest first: hypotheses, or laws of the remainder.
+    """Return the hypotheses, or laws, that are not ruled out, the likeliest first; none if all is decided.
 
-    Where no effect is named although one is likelier than none, the plant as it is counts, too. Where nothing
-    else confirms an effect, it counts by the chance that this leaves. Each has its probability and its name.
-    The list is empty where nothing is undecided."""
+    Each has its probability and its name. Unless the verdict is ambiguous, the plant without effects is one
+    of them. If other data confirmed no effect, its probability is at least that of this doubt."""
     verdict = found.decision.verdict
     if verdict in ("ambiguous", "unexplained") or (
         verdict == "consistent" and found.posterior.something > 0.5
@@ -194,9 +193,7 @@ def _effects(keys: Iterable[Key]) -> str:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A simulated candidate.
-
-    Its information, the distances D (n, n) and each hypothesis's prediction."""
+    """A simulated candidate: its information, the distances D (n, n), and each hypothesis's prediction."""
 
     excitation: Excitation
     bits: float
@@ -205,12 +202,12 @@ class _Trial:
 
     @property
     def bits_per_second(self) -> float:
-        """Return the information by time."""
+        """Return the information per second of the experiment."""
         return self.bits / self.excitation.duration_s
 
 
 class _Comparison:
-    """The hypotheses of an undecided diagnosis, and what an experiment would tell between them."""
+    """The hypotheses of an undecided diagnosis, and the information of an experiment about them."""
 
     def __init__(self, case: Case, standing: Sequence[Standing], limits: Ranges):
         self.case, self.limits = case, limits
@@ -227,11 +224,11 @@ class _Comparison:
         self.trials = int(np.clip(NUMBERS / numbers, FEWEST_TRIALS, TRIALS))
 
     def grid(self, x: Excitation) -> float:
-        """The step of a simulated experiment, s."""
+        """Return the time step of a simulated experiment, s."""
         return max(self.step, x.duration_s / self.points)
 
     def trial(self, x: Excitation) -> _Trial | None:
-        """Simulate a candidate; None where a hypothesis cannot, or where a reading leaves its limits."""
+        """Simulate a candidate; None if a simulation fails, or a reading leaves its limits."""
         table = x.table(self.case.plant, self.grid(x))
         predictions = [p for b in self.predictors if (p := b.predict(table)) is not None]
         if len(predictions) < len(self.predictors) or self._leaves_limits(predictions):
@@ -242,7 +239,9 @@ class _Comparison:
     def distances(
         self, predictions: Sequence[Prediction], sigma: np.ndarray, state: str | None = None
     ) -> np.ndarray:
-        """Compute D of every two hypotheses over the recorded outputs, and over a state with a sensor."""
+        """Compute D of every two hypotheses over the recorded outputs.
+
+        `state`: name of a state that is assumed to have a sensor, too; `sigma`: noise of each column."""
         columns = []
         for b in self.predictors:
             recorded = [b.model.outputs.index(self.outputs[j]) for j in self.seen]
@@ -250,9 +249,9 @@ class _Comparison:
         return distances(predictions, columns, sigma)
 
     def _leaves_limits(self, predictions: Sequence[Prediction]) -> bool:
-        """Whether any hypothesis predicts a reading outside its limits.
+        """Return whether any hypothesis predicts a reading outside its limits.
 
-        Without limits: outside the recorded range, widened only to where the rig starts from."""
+        Without limits, the recorded range counts, widened to include the experiment's initial value."""
         for j, o in enumerate(self.outputs):
             y = _recorded(self.case, j)
             for p, _ in predictions if len(y) or o in self.limits else ():
@@ -273,7 +272,7 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None where nothing is undecided (`survivors`) or nothing can be driven.
+    None if all is decided (`survivors`) or no input can be driven.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = found.case
     for n in limits:
@@ -305,7 +304,7 @@ def propose(
 
 
 def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, Any]:
-    """The proposal as diagnosis.json holds it."""
+    """Return the proposal as `next_experiment` of diagnosis.json."""
     x, (first, *others) = best.excitation, comparison.predictors
     hours = x.duration_s / 3600
     sigmas = np.sqrt(best.distances[0, 1:])
@@ -336,7 +335,7 @@ def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, 
 
 
 def _smaller(lever: Lever, share: float) -> Lever:
-    """The lever with its range drawn together about its rest."""
+    """Return the lever with the excursions from rest multiplied by `share`."""
     return dataclasses.replace(
         lever,
         low=lever.rest + share * (lever.low - lever.rest),
@@ -345,7 +344,7 @@ def _smaller(lever: Lever, share: float) -> Lever:
 
 
 def _recorded(case: Case, j: int) -> np.ndarray:
-    """All readings of output number j."""
+    """Return all finite readings of output j, of all recordings."""
     column = list(case.plant.outputs.values())[j].column
     parts = [t.columns[column] for t in case.tables if column in t.columns]
     return np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
@@ -367,9 +366,7 @@ def _predicted(comparison: _Comparison, predictions: Sequence[np.ndarray]) -> di
 
 
 def _sensor(comparison: _Comparison, best: _Trial) -> str:
-    """Where even the best experiment leaves doubt.
-
-    The stored quantity whose own sensor would tell most, in words."""
+    """Return a sentence on the sensor that would add most to an experiment that does not decide."""
     plant, sigma, seen = comparison.case.plant, comparison.sigma, comparison.seen
     grid = comparison.grid(best.excitation)
     share = np.sqrt(comparison.step / grid)
@@ -386,9 +383,9 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
         ):
             continue
         noise = np.append(sigma[seen], np.median(alike)) * share
-        told = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
-        if told > most:
-            most, where = told + WORTH_A_SENSOR, node.name
+        with_sensor = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
+        if with_sensor > most:
+            most, where = with_sensor + WORTH_A_SENSOR, node.name
     if where:
         return f"A sensor of its own at {where} would tell more ({most - WORTH_A_SENSOR:.2f} bits with the same experiment)."
     return (

@@ -1,6 +1,4 @@
-"""Decide by experiments.
-
-Diagnose, run the proposed experiment on the rig, and diagnose again with its data."""
+"""Decide by experiments: diagnose, run the proposed experiment on the rig, diagnose again with its data."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ def resolve(
     rounds: int = ROUNDS,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Diagnose, and while nothing is decided run the proposed experiment, `rounds` times at most.
+    """Diagnose; while an experiment is proposed, run it and diagnose again, `rounds` times at most.
 
     `diagnosed(recordings)` writes a result into `out`; `record(experiment, recording)` runs an experiment
     file on the rig; `say` is called in each round. The last result lists the experiments and verdicts in

@@ -1,1 +1,1 @@
-"""Hypotheses: the catalogue's entries, the places of a plant, and a plant with an entry at a place."""
+"""Hypotheses: the catalogue's entries, the places in a plant, and a plant with an entry at a place."""

@@ -1,4 +1,4 @@
-"""A plant with an effect: the changes of a catalogue's entry, put into the plant at a place."""
+"""Build a plant with an effect: apply the changes of a catalogue entry to the plant at a place."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 
-_form = cache(ex.parse)  # the catalogue's forms are read once
+_form = cache(ex.parse)  # each expression of the catalogue is parsed once
 
 
 @dataclass
@@ -33,11 +33,11 @@ class Placement:
     label: str = ""
 
     def own(self, parameter: str) -> str:
-        """The plant's name of one of the effect's parameters."""
+        """Return the name in the plant of one of the effect's parameters."""
         return f"{parameter}_{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
 
     def bounds(self, p: EffectParameter) -> tuple[float, float]:
-        """Where physics lets a parameter be."""
+        """Return the physical bounds of a parameter, from the catalogue and the recordings."""
         origin = self.rig.first_air(self.rig.drives[0]) if p.origin == "first_air" else 0.0
         unit = 1.0
         if p.of == "jump":
@@ -48,7 +48,7 @@ class Placement:
 
 
 class Builder:
-    """The plant's parts while a change of the catalogue is put into them."""
+    """The parts of a plant while the changes of an effect are applied to them."""
 
     def __init__(self, c: Placement, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]]):
         self.c, self.rig, self.base = c, c.rig, c.rig.plant
@@ -58,13 +58,15 @@ class Builder:
             dict(self.base.flows),
             dict(self.base.outputs),
         )
-        self.made: dict[str, str] = {}  # nodes that the effect brings: its own name to the plant's
+        # Nodes that the effect adds: name in the catalogue -> name in the plant.
+        self.made: dict[str, str] = {}
         self.symbols: dict[str, Expr] = {**c.place.symbols, **c.symbols}
         if self.rig.air:
             self.symbols.setdefault("air", name(self.rig.air))
         place = c.place
         o = self.base.outputs.get(place.output or "")
-        # Physics and slow sensors come before their electronics, in whichever order a search adds them.
+        # An effect of physics or of a slow sensor acts before the errors of the sensor's electronics, in
+        # whichever order a search adds them.
         self.inside = o.sensed if o and o.sensed and not self._of_electronics() else None
         if self.inside and "y" in place.symbols:
             self.symbols["y"] = self.inside
@@ -99,12 +101,12 @@ class Builder:
             self._record(n)
 
     def _record(self, signal: str) -> None:
-        """A recorded column that the plant did not read becomes an input."""
+        """Add an input for a recorded column that the plant does not read."""
         if signal in self.rig.spare and signal not in self.inputs:
             self.inputs[signal] = Input(signal, None, signal, False)
 
     def _celsius(self, e: Expr) -> Expr:
-        """A temperature as the catalogue's forms count it."""
+        """Return a temperature in degrees Celsius, the unit of the catalogue's expressions."""
         return ex.add(e, num(-zero_of(self._signal_unit(e))))
 
     def _unit_of_y(self) -> str | None:
@@ -144,7 +146,7 @@ class Builder:
         return re.sub(r"\b(?=[WJ]\b)", self._prefix(), text)
 
     def _prefix(self) -> str:
-        """The m of mW where the heat flows of the place are counted so."""
+        """Return the SI prefix of the heat flows at the place ("m" for mW), or ""."""
         place = self.c.place
         flow = self.base.flows.get(place.flow or "")
         ends = {*place.nodes.values(), *((flow.source, flow.target) if flow else ())}
@@ -152,10 +154,10 @@ class Builder:
         return next((u[:-1] for u in units if kind_of(u) == "power" and u.endswith("W")), "")
 
     def expression(self, text: str | float) -> Expr:
-        """A form of the catalogue with its symbols filled in."""
+        """Return an expression of the catalogue with its symbols replaced by the plant's expressions."""
 
         def change(e: Expr) -> Expr | None:
-            """Return the plant's expression for a symbol of the form."""
+            """Return the plant's expression for a symbol of the catalogue."""
             return self.symbols.get(e.value) if e.op == "name" else None
 
         return ex.substitute(_form(text), change)
@@ -202,7 +204,7 @@ class Builder:
         self._put(self.expression(form))
 
     def _of_electronics(self) -> bool:
-        """Is the effect an error of a reading that holds no memory?"""
+        """Is the effect an error of a reading without a state of its own?"""
         changes = self.c.effect.changes[self.c.variant]
         return self.c.effect.where in ERRORS and not any("node" in item for item in changes)
 
@@ -218,10 +220,10 @@ class Builder:
             return
 
         def change(e: Expr) -> Expr | None:
-            """Return the changed reading in the place of the recorded input."""
+            """Return the changed reading that replaces the recorded input."""
             return new if e.op == "name" and e.value == p.input else None
 
-        # The start stays as read: an expression of the first sample knows no node, no time and no delay.
+        # Initial states keep the input as read: their expressions can hold no node, no time and no delay.
         self.flows = {
             k: dataclasses.replace(f, rate=ex.substitute(f.rate, change)) if k in self.base.flows else f
             for k, f in self.flows.items()
@@ -246,7 +248,7 @@ class Builder:
             spread = spread or self._spread_at_start(source)
 
             def start(e: Expr) -> Expr | None:
-                """Return the start of a node; zero for the time; a delayed signal as it is."""
+                """Return a node's initial state, 0 for the time, and the signal for a delayed signal."""
                 return (
                     self.base.nodes[e.value].initial
                     if e.op == "name" and e.value in self.base.nodes
@@ -267,7 +269,7 @@ class Builder:
         )
 
     def _spread_at_start(self, source: Expr) -> float | None:
-        """How uncertain the start of what begins where `source` does is: as uncertain as the nodes in it."""
+        """Return the standard deviation of `source` at the start, from its nodes' standard deviations."""
         known = {q: p.value for q, p in self.base.parameters.items()}
         source = ex.substitute(source, lambda e: e.args[0] if e.op == "delay" else None)
         total = 0.0
@@ -278,12 +280,12 @@ class Builder:
         return float(np.sqrt(total)) or None
 
     def _straight(self, symbol: str) -> None:
-        """Let inputs that hold go on straight lines in this symbol.
+        """Interpolate held inputs linearly in this symbol.
 
-        A sensor's lag is short against a sample, and would otherwise be a sample late."""
+        Otherwise the lag of a sensor, which is short against a sample, would be a sample late."""
 
         def change(e: Expr) -> Expr | None:
-            """Return the twin of a held input, which goes on straight lines."""
+            """Return the linearly interpolated copy of a held input."""
             i = self.base.inputs.get(e.value) if e.op == "name" else None
             if i is None or i.linear:
                 return None
@@ -312,7 +314,7 @@ class Builder:
         dt = self.symbols["sample"].value
         over = ex.parse(f"max({a} - {self.c.own(what['level'])}, 0) * {2.0 / dt!r}")
         share = name(self.c.own(what["share"]))
-        # spilled volume by time; the rate is so stiff that it holds the level within a sample
+        # volume a second; the factor 2 / dt brings the level back to its limit within a sample
         over = ex.mul(over, self.base.nodes[a].storage)
         unit = next((f.unit for f in self.base.flows.values() if f.source == a), None)
         if b:
@@ -336,7 +338,7 @@ class Builder:
         ohms = [q for q, p in self.base.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)]
 
         def change(e: Expr) -> Expr | None:
-            """Return the form in the place of a resistance."""
+            """Return the changed expression of a resistance."""
             if e.op == "name" and e.value in ohms:
                 self.symbols["R"] = e
                 return self.expression(form)
@@ -351,6 +353,6 @@ class Builder:
 
 
 def _changed(o: Output, change: Callable[[Expr], Expr | None]) -> Output:
-    """Return an output whose value a substitution changes."""
+    """Return an output after a substitution in its value and in the value that its sensor reads."""
     sensed = ex.substitute(o.sensed, change) if o.sensed else None
     return dataclasses.replace(o, value=ex.substitute(o.value, change), sensed=sensed)

@@ -21,16 +21,16 @@ Key = tuple[str, str]  # (effect, where)
 
 
 class Candidate(Placement):
-    """A placed effect as a search sees it: its bounds, its priors, the plant with it."""
+    """A placed effect with its key, its priors, and the plant with it."""
 
     @property
     def key(self) -> Key:
-        """Return (effect, where), as a result names it."""
+        """Return (effect, place), the names in the result."""
         return self.effect.name, self.place.where
 
     @property
     def jumps(self) -> bool:
-        """Does what a sensor reads hold inputs that go in steps?"""
+        """Does the reading depend on held inputs, which change in steps?"""
         y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
         return y is not None and any(
             i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y)
@@ -40,7 +40,7 @@ class Candidate(Placement):
         """Return the priors of the effect's parameters in `plant`, for each recording."""
         if self.effect.prior is None:
             return []
-        # a parameter without a value of its own in each recording counts once
+        # a parameter that all recordings share has one prior, of which each recording gets an equal part
         share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
         out = []
         for d in self.rig.drives:
@@ -62,7 +62,7 @@ class Candidate(Placement):
         return out
 
     def surprise(self, plant: Plant) -> float:
-        """-2 log of how likely the values are that `plant` holds for the effect, over all recordings."""
+        """Return -2 log prior of the effect's values in `plant`, over all recordings."""
         total = 0.0
         for b in self.beliefs(plant):
             total += float(
@@ -81,12 +81,12 @@ class Candidate(Placement):
     ) -> Plant:
         """Return the plant with the effect.
 
-        `values`: of its parameters, by the effect's names; a number, or one a recording."""
+        `values`: by parameter of the effect, a number or one for each recording."""
         return Builder(self, values, ranges or {}).plant()
 
 
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
-    """Every effect at every place it can sit, with every choice of the signals it needs.
+    """Return every effect at every place where it can act, with every choice of the signals it needs.
 
     A plant with trusted sensors has no faults of readings."""
     out = []
@@ -112,6 +112,6 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                 for k, choice in enumerate(choices):
                     candidate = Candidate(here, place, rig, variant, choice, f"{variant}{k}")
                     if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
-                        continue  # it goes on straight lines in any case
+                        continue  # without a held input it would equal the variant without `straight`
                     out.append(candidate)
     return out

@@ -1,4 +1,4 @@
-"""The catalogue of left-out physics, read from files (config/effects/*.yaml, and a user's own folders)."""
+"""The catalogue of effects, read from files: config/effects/*.yaml, and a user's own folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CATALOGUE = shipped("config/effects")
 
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
-    """Return all entries of these folders; a later one replaces one of the same name. Raises InputError."""
+    """Return all entries of these folders by name. A later entry of the same name wins. Raises InputError."""
     found = {}
     for folder in folders:
         files = sorted(Path(folder).glob("*.yaml"))
@@ -26,5 +26,5 @@ def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
 
 
 def contained(entries: Mapping[str, Effect]) -> dict[str, str]:
-    """Return the simpler effect that some entries contain."""
+    """Return, by entry, the simpler effect that it contains, for the entries that contain one."""
     return {e.name: e.contains for e in entries.values() if e.contains}

@@ -1,6 +1,6 @@
-"""An effect of the catalogue, and the reader of its file: strict, key by key.
+"""An effect of the catalogue, and the reader of its file, which checks every key.
 
-A wrong key, an unknown name in an expression or a wrong change is one error with its place in the file.
+A wrong key, an unknown name in an expression or a wrong change raises InputError with file, line and column.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ SHAPES: Mapping[str, tuple[str, ...]] = {
     "creep_speeds": ("creep",),
     "distances": ("distance",),
 }
-"""The kinds of shapes, and the names of the values that each gives to parameters and trials."""
+"""The kinds of shapes, and the names of the values that each kind has in `shape:` and `trial:`."""
 UNITS_OF = ("unit_of_y", "unit_of_rate", *(f"unit_of_{signal}" for signal in "vxuaiT"))
-"""Units of parameters that the place gives: of its reading, its flow, and its signals."""
+"""Units of parameters that depend on the place: those of its reading, its flow, and its signals."""
 FORMS = ("rate", "value", "storage", "drive", "resistance")
 PARTS = {
     "flow": (("rate",), ("from", "into")),
@@ -69,10 +69,10 @@ PARTS = {
     "split": (("from", "into", "share"), ()),
     "spill": (("from", "into", "level", "share"), ()),
 }
-"""The keys of a change that is a mapping: required ones, others."""
+"""The keys of a change that is a mapping: (required, optional)."""
 _STARTS = ("start_of_T", "start_of_y", "start_of_x", "first_air")
 OWN = {"rate": "rate", "storage": "storage", "resistance": "R"}
-"""The symbol that stands, in a change of this kind, for the plant's own expression."""
+"""By kind of change, the symbol for the plant's own expression that the change replaces."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class EffectParameter:
     """One parameter of an effect.
 
     - `trial`: its value in screening, an expression of the amplitudes s, s2, s3 and of shapes
-    - `shape`: the shape that it is
+    - `shape`: the name of the shape value that it equals
     - `null`: its value where the effect is absent
-    - `at_zero`: where it is 0 the effect is the simpler one that it contains
-    - `of`: 'jump': low and high count in the largest sudden change of what the sensor reads"""
+    - `at_zero`: does 0 turn the effect into the simpler one that it contains?
+    - `of`: with 'jump', low and high are multiples of the largest sudden change of the reading"""
 
     name: str
     unit: str | None
@@ -94,17 +94,18 @@ class EffectParameter:
     shape: str | None
     per_recording: bool
     typical: float | None
-    origin: str | None  # 'first_air': bounds count from the first ambient; 'exponent': null is the outlet's
+    # 'first_air': bounds are relative to the first ambient; 'exponent': null is the outlet's exponent.
+    origin: str | None
     at_zero: bool = False
     of: str | None = None
 
     @property
     def amplitude(self) -> bool:
-        """Does it scale with an amplitude of the screening?"""
+        """Does its trial value depend on an amplitude?"""
         return _amplitudes(self.trial) > 0
 
     def fades(self, shapes: Mapping[str, str]) -> bool:
-        """Is the effect absent where this parameter has its null value? `shapes`: those of its effect."""
+        """Is the effect absent if this parameter has its null value? `shapes`: those of its effect."""
         return self.amplitude or shapes.get(self.shape or "") in ("small_levels", "lags", "delays")
 
 
@@ -123,20 +124,20 @@ class Effect:
     excited_by: str
     mimics: tuple[str, ...]
     source: str
-    caution: str | None = None  # limits of a finding of it, in words
-    prior: Expr | None = None  # -2 log of how likely its parameters' values are, beyond their bounds
+    caution: str | None = None  # a sentence on the limits of such a finding
+    prior: Expr | None = None  # -2 log prior of its parameters, inside their bounds
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
-    reads: tuple[str, ...] = ()  # nodes and inputs by name: an effect of one's own rig
+    reads: tuple[str, ...] = ()  # names of nodes and inputs that it reads: an effect for one plant
 
     def at(self, exponent: float | None) -> Effect | None:
-        """Return the entry at an outlet with this exponent in the plant file; None beyond its bounds."""
+        """Return the entry for an outlet with this exponent in the plant file; None outside its bounds."""
         own = [p for p in self.parameters if p.origin == "exponent"]
         if exponent is None or not own:
             return self
         if not all(p.low <= exponent <= p.high for p in own):
             return None
 
-        def told(p: EffectParameter) -> EffectParameter:
+        def with_null(p: EffectParameter) -> EffectParameter:
             """Return the parameter with the outlet's exponent as its null value."""
             if p.origin != "exponent" or p.trial is None:
                 return p
@@ -144,11 +145,11 @@ class Effect:
             trial = ex.substitute(p.trial, lambda e: known.get(str(e.value)) if e.op == "name" else None)
             return dataclasses.replace(p, null=exponent, trial=trial)
 
-        return dataclasses.replace(self, parameters=tuple(map(told, self.parameters)))
+        return dataclasses.replace(self, parameters=tuple(map(with_null, self.parameters)))
 
     @property
     def timed(self) -> bool:
-        """Does it depend on the time itself, or have values of its own in each recording?"""
+        """Does it depend on the time itself, or have parameters with a value for each recording?"""
         named = re.search(r"\bt\b", str(self.changes))
         return bool(named) or any(p.per_recording for p in self.parameters)
 
@@ -207,9 +208,9 @@ def _shapes(top: Section) -> dict[str, str]:
 
 
 def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, Section]) -> EffectParameter:
-    """Read a parameter; `given`: the names of the values that the effect's shapes give."""
+    """Read a parameter. `given`: the names of the values of the effect's shapes."""
     low, high = p.number("low", -np.inf), p.number("high", np.inf)
-    if not low <= high:  # equal: a known value
+    if not low <= high:  # equal bounds fix the value
         raise p.node.error(f"parameter '{name}': low {low:g} must not be above high {high:g}")
     unit = p.text("unit", "")
     for of in re.findall(r"unit_of\w*", unit):
@@ -257,7 +258,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
 
 
 def _dims(top: Section, count: int) -> tuple[tuple[float, ...], ...]:
-    """Return the rows of amplitudes, one for each amplitude where the file has none."""
+    """Return the amplitudes of each direction; if the file states none, one direction for each amplitude."""
     rows = top.list("dims", required=False)
     for row in rows:
         if not isinstance(row.value, list) or len(row.value) != count:

@@ -1,4 +1,4 @@
-"""The places of a plant at which an entry of the catalogue can sit, by the kind that the entry names."""
+"""The places of a plant where a catalogue entry can act, by the entry's kind of place (`where:`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from thermoctl.plant.language import Flow, Plant
 
 @dataclass(frozen=True)
 class Place:
-    """Where an effect sits, by the name that a result gives, and what its symbols stand for there."""
+    """Where an effect acts: its name in a result, and the plant's expressions for the effect's symbols."""
 
     where: str
     symbols: Mapping[str, Expr] = field(default_factory=dict)
@@ -22,10 +22,10 @@ class Place:
     flow: str | None = None
     output: str | None = None
     input: str | None = None
-    exponent: float | None = None  # of an outlet, as the plant file has it
+    exponent: float | None = None  # exponent of an outlet, in the plant file
 
     def parts(self) -> set[str]:
-        """The nodes and the flow that it names (not those that a reading is made of)."""
+        """Return the nodes and the flow that the effect changes or reads, without those in a reading."""
         named = {str(e.value) for s, e in self.symbols.items() if s != "y" and e.op == "name"}
         return {*self.nodes.values(), *named} | ({self.flow} if self.flow else set())
 
@@ -45,7 +45,7 @@ def _velocity_nodes(rig: Rig) -> Iterator[Place]:
 
 
 def _storing(rig: Rig) -> list[str]:
-    """The nodes that a flow can fill; a position stores nothing."""
+    """Return the nodes that are ends of flows and store something; a position does not."""
     ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
     return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
 
@@ -85,9 +85,9 @@ def _heated_pairs(rig: Rig) -> Iterator[Place]:
 
 
 def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
-    """Return the flows of heat from outside into a node that follow inputs, not temperatures of the network.
+    """Return the flows of heat from outside into a node that inputs drive, not temperature differences.
 
-    Temperatures may change such a flow (copper's resistance), but it is zero while the inputs rest."""
+    Temperatures may change such a flow (copper's resistance), but it is zero if the inputs are zero."""
     return [
         f
         for f in plant.flows.values()
@@ -101,7 +101,7 @@ def heats(plant: Plant, node: str, rig: Rig) -> list[Flow]:
 
 
 def _rests(plant: Plant, f: Flow) -> bool:
-    """Is a flow nothing while all inputs are zero, whatever the temperatures?"""
+    """Is a flow zero if all inputs are zero, at any temperatures?"""
     if any(e.op == "delay" for e in ex.walk(f.rate)):
         return False
     at = {
@@ -131,7 +131,7 @@ def _motors(rig: Rig) -> Iterator[Place]:
 
 
 def driven(rig: Rig) -> Iterator[Place]:
-    """Yield each input that drives a motor or a pump by its flow; by its own name where that is an FMU's."""
+    """Yield each input that drives a motor or a pump, named by its flow (in an FMU, by the input)."""
     for f in rig.physics.flows.values():
         if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):
@@ -139,7 +139,7 @@ def driven(rig: Rig) -> Iterator[Place]:
 
 
 def askable(rig: Rig, place: Place) -> bool:
-    """Return whether the plant shows what an effect at the place would change.
+    """Return whether the expression that an effect at the place would change is known.
 
     The rate of an FMU is a body's whole balance, not one flow: only an input in it can be changed."""
     return place.input is not None or not place.flow or not ex.calls_fmu(rig.physics.flows[place.flow].rate)
@@ -161,7 +161,7 @@ def _of_bodies(rig: Rig) -> Iterator[Place]:
 
 
 def _passive(rig: Rig) -> Iterator[Place]:
-    """Sensors, without the inputs that drive: a late or clipped drive is the actuator's entry."""
+    """Yield sensors without driving inputs: the place `drive` is for delayed or clipped drives."""
     driving = {p.input for p in driven(rig)}
     yield from (p for p in _sensors(rig) if not p.input or p.input not in driving)
 
@@ -204,7 +204,7 @@ def _voltages(rig: Rig) -> Iterator[Place]:
 
 
 def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
-    """Return the part of an outflow that follows its vessel's level, the head in it, and its exponent."""
+    """Return the part of an outflow that depends on its vessel's level, the head in it, and its exponent."""
     node = rig.physics.nodes.get(f.source or "")
     if node is None or node.name in (*rig.temperatures, *rig.velocities, *rig.position_of.values()):
         return None
@@ -220,7 +220,7 @@ def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
         if len(factors) != 1 or (head.op == "/" and factors[0] is not head.args[0]):
             return None
         head = factors[0]
-    # Only a unit tells a level whose outlet is taken as laminar from any other state that decays.
+    # Only the unit distinguishes a level with a laminar outlet from any other state that decays.
     if rig.kind(node) not in ("length", "volume") or ex.names(head) & rig.physics.nodes.keys() != {node.name}:
         return None
     return head, head if head.op == "max" else ex.make("max", head, ex.num(0.0)), 1.0
@@ -259,21 +259,22 @@ def _free(rig: Rig, e: Expr) -> bool:
 
 
 def _fixed_nodes(rig: Rig) -> Iterator[Place]:
-    """Yield nodes whose storage a refit cannot move. A storage of 1 is a definition: dn/dt = sum of flows."""
+    """Yield nodes whose storage has no free parameter, except a storage of 1: dn/dt = sum of flows."""
     storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
     yield from _nodes(rig, [n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)], "T")
 
 
 def _fixed_flows(rig: Rig) -> Iterator[Place]:
-    """Flows that follow their own node, and whose size a refit cannot move."""
+    """Yield flows that depend on their own node, and that have no free parameter."""
     for f in rig.physics.flows.values():
         ends = {e for e in (f.source, f.target) if e}
         if ends & ex.names(f.rate) & set(_storing(rig)) and not _free(rig, f.rate):
             yield Place(f.name, {}, flow=f.name)
 
 
-ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")  # places of errors of a reading
-FAULTS = (*ERRORS, "reading_in_air")  # which a plant with `sensors: trusted` has not
+# Places where an effect is an error of a reading.
+ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")
+FAULTS = (*ERRORS, "reading_in_air")  # places that do not exist in a plant with `sensors: trusted`
 PLACES = {
     "node": lambda rig: _nodes(rig, _storing(rig), "n"),
     "node_pair": _exchanging,

@@ -1,4 +1,4 @@
-"""A plant and its recordings as the catalogue sees them: kinds of signals, moving inputs, the air."""
+"""Kinds of signals, moving inputs and ambient of a plant and its recordings, for placing effects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from thermoctl.plant.simulation.simulate import Excitation
 
 SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
-STRAIGHT = "_straight"  # of the name of an input that holds, where it goes on straight lines
+STRAIGHT = "_straight"  # suffix of the linearly interpolated copy of a held input
 KELVIN = {"K", "kelvin"}
 ZERO_DEGC = 273.15  # K
 TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
@@ -52,29 +52,30 @@ def kind_of(unit: str | None) -> str:
 
 
 def zero_of(unit: str | None) -> float:
-    """The reading of 0 degC in a unit of temperature."""
+    """Return the value of 0 degC in a unit of temperature."""
     return ZERO_DEGC if unit in KELVIN else 0.0
 
 
-_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # the other roles are kinds of their own
+_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # every other role is also the name of a kind
 
 
-# Nodes that an effect brought to model a reading (lag, memory of the start): no bodies, no places.
+# Nodes that an effect added to model a reading (lag, memory of the initial state) are no places.
 _READINGS = re.compile(
     r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
 )
 
 
-# Nothing states what a column is that the plant does not read: its name is a guess, and a note in the result.
+# Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
+# has a note about each guess.
 SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"current|^i$", "T": r"temp|_c$|^t_"}
 MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
 
 
-JUMP = 3  # samples within which a sudden change is over: a filter before the recording may smear it
+JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
 
 
 class Rig:
-    """A plant and its recordings as the catalogue sees them: kinds of nodes, moving inputs, the air."""
+    """A plant and its recordings: kinds of nodes, moving inputs, ambient, by roles and units."""
 
     def __init__(
         self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
@@ -147,11 +148,11 @@ class Rig:
         return self._jumps[reading.column]
 
     def kind(self, q: Input | Node | Output) -> str:
-        """Return the kind of a quantity, from its role or else its unit; empty where neither has one."""
+        """Return the kind of a quantity, from its role or else its unit; "" where neither states it."""
         return _ROLE_KINDS.get(q.role, q.role) if q.role else kind_of(q.unit)
 
     def _coolest(self) -> str | None:
-        """The temperature input that losses of heat are counted from."""
+        """Return the temperature input that is the reference of heat losses."""
         for f in self.physics.flows.values():
             if f.target is None or f.source is None:
                 for i in self.heat_inputs:
@@ -160,14 +161,14 @@ class Rig:
         return self.heat_inputs[0] if self.heat_inputs else None
 
     def first_air(self, d: Excitation) -> float:
-        """The ambient at a recording's start, degC; 0 without one."""
+        """Return the ambient temperature at a recording's start, degC; 0 if there is none."""
         air = self.air or ""
         known = self.plant.parameters.get(air) or self.plant.inputs.get(air)
         start = d.first.get(air, known.value if isinstance(known, Parameter) else 0.0)
         return float(start - zero_of(known.unit) if known else start)
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
-        """Names that can stand for v, x, i or T: nodes, inputs, recorded columns (which become inputs)."""
+        """Return names that can stand for v, x, i or T: nodes, inputs and unread columns."""
         p = self.physics
         if kind == "v":
             if near in self.velocities:
@@ -193,22 +194,22 @@ class Rig:
         return found + self.guessed("T")
 
     def guessed(self, kind: str) -> list[str]:
-        """Return the columns that the plant does not read and that sound like v, x, i or T."""
+        """Return the columns that the plant does not read and whose name suggests v, x, i or T."""
         return [c for c in self.spare if re.search(SOUNDS[kind], c, re.I)]
 
     def is_motor(self, f: Flow) -> bool:
-        """A flow of force that an input drives."""
+        """Return whether a flow is a force or a torque that an input drives."""
         return bool(
             (f.target in self.velocities or f.source in self.velocities)
             and ex.names(f.rate) & self.moving_inputs
         )
 
     def is_pump(self, f: Flow) -> bool:
-        """A flow from outside, of something else than heat or force, that an input drives."""
+        """Return whether a flow enters from outside and is neither heat nor a force."""
         return f.source is None and f.target not in (None, *self.temperatures, *self.velocities)
 
     def drives_of(self, f: Flow) -> list[str]:
-        """The inputs that drive a flow (temperatures, positions and references aside)."""
+        """Return the moving inputs that drive a flow, except temperatures, lengths and velocities."""
         return [
             i
             for i in self.physics.inputs

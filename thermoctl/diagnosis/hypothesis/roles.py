@@ -1,8 +1,8 @@
 """Kinds of quantities from `role`, units and structure of the plant, never from its names.
 
-Only a column that the plant does not read has neither: then its name gives a guess.
-Of a pair of nodes, one the rate of the other, one is a velocity and one its position, in any unit. The
-ambient is the temperature that losses of heat are counted from. Each assumption is a note in the result."""
+Only a column that the plant does not read has none of these: then its name gives a guess.
+If one node is the rate of another, the two are a velocity and its position, in any unit. The ambient is the
+reference temperature of heat losses. Each assumption is a note in the result."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from thermoctl.plant.language import Input, Node, Output, Plant
 if TYPE_CHECKING:
     from thermoctl.plant.simulation.simulate import Excitation
 
-RATES = ("", "velocity", "rotation", "voltage")  # kinds that a velocity by structure may have
-PLACES = ("", "length", "voltage")  # kinds that its position may have
+RATES = ("", "velocity", "rotation", "voltage")  # kinds by unit of a node that structure makes a velocity
+PLACES = ("", "length", "voltage")  # kinds by unit of its position
 
 
 def motions(plant: Plant) -> dict[str, str]:
-    """Return velocity nodes and their position nodes, which store nothing but a multiple of the velocity."""
+    """Return velocity nodes and their position nodes: the integral of a multiple of the velocity."""
     values = {p.name: p.value for p in plant.parameters.values()}
     found = {}
     for x in plant.nodes.values():
@@ -32,7 +32,7 @@ def motions(plant: Plant) -> dict[str, str]:
             continue
         rate, read = flows[0].rate, ex.names(flows[0].rate) - values.keys()
         if any(e.op == "delay" for e in ex.walk(rate)):
-            continue  # not the velocity of now
+            continue  # not the present velocity
         for v in plant.nodes.keys() & read - {x.name}:
             driven = any(v in (f.source, f.target) for f in plant.flows.values())
             constant = ex.names(x.storage) | ex.names(ex.derivative(rate, v)) <= values.keys()
@@ -42,7 +42,7 @@ def motions(plant: Plant) -> dict[str, str]:
 
 
 class Structure(Rig):
-    """A plant and its recordings as the catalogue sees them, by roles, units and structure."""
+    """A plant and its recordings: kinds of nodes, moving inputs, ambient, by roles, units and structure."""
 
     def __init__(
         self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
@@ -86,7 +86,7 @@ class Structure(Rig):
         return {}
 
     def _coolest(self) -> str | None:
-        """Return the ambient: the reference temperature of most heat losses; of several the coolest."""
+        """Return the ambient: the reference temperature of most heat losses; among equals the coolest."""
         count = self._ambients()
         return min(count, key=lambda i: (-count[i], self._mean(i)), default=None)
 
@@ -117,7 +117,7 @@ class Structure(Rig):
         return out
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
-        """Return names that can stand for v, x, i or T; for T also unread columns that sound like nothing."""
+        """Return names that can stand for v, x, i or T; for T also unread columns without a guess."""
         found = super().signals(kind, near)
         if kind == "T":
             found += [c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS)]

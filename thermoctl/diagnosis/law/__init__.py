@@ -1,1 +1,1 @@
-"""An unknown law of the remainder: proposed, refitted, weighed and written."""
+"""Unknown laws: proposals from the residual, their refits, their evidence, and their part of the result."""

@@ -1,8 +1,8 @@
-"""Unknown laws as hypotheses beside those of the catalogue: one search, one evidence, one table of odds.
+"""Unknown laws as hypotheses beside those of the catalogue, with the same search, evidence and prior odds.
 
 A law is proposed from the residual of a hypothesis (`propose`), refitted, and extended by effects of the
-catalogue like any other. Its prior odds are those of an effect that is rare, less the cost of the choice
-among places, signals and forms (`Proposal.cost`)."""
+catalogue like any other hypothesis. Each of its terms has the prior odds of an effect that is `rare`. The
+choice among places, signals and forms makes them smaller (`Proposal.cost`)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def with_laws(
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
-    A plant that leaves only noise needs none. Nor does one effect that leaves only noise: a law is rarer than
-    it, and cannot fit better."""
+    No law is sought if the residual of the plant, or of one effect, is only noise. A law has smaller prior
+    odds than the effect and cannot fit better."""
     best = found.tried[0].fitted
     if len(best.hypothesis.effects) <= 1 and only_noise(case, best, limits):
         return found
@@ -57,7 +57,8 @@ def _laws(
 ) -> list[Weighed]:
     """Return a hypothesis with the best law at each place.
 
-    Only laws that may come near the score `ahead` are refitted. Sums of terms follow if one term is ahead."""
+    Only laws that may come near the score `ahead` are refitted. Sums of terms are refitted only if a law with
+    one term reaches that score."""
     try:
         proposals, _ = propose_laws(case, parent.fitted, limits.rare)
     except (SimulationError, np.linalg.LinAlgError):
@@ -67,7 +68,7 @@ def _laws(
     term = float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
 
     def cost(p: Proposal) -> float:
-        """Return minus the log prior odds of a law: each term is a piece of physics that nobody named."""
+        """Return minus the log prior odds of a law: for each term `missing` and `rare`, and its own cost."""
         return p.cost - term * len(p.terms)
 
     found: list[tuple[Proposal, Weighed]] = []
@@ -83,7 +84,7 @@ def _laws(
 
 
 def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
-    """Return the likeliest of the laws at one place; with others that fit about as well."""
+    """Return the likeliest law at one place. Its `rivals` are the others that fit about as well."""
     share = softmax(np.array([w.score for _, w in found]))
     order = np.argsort(-share, kind="stable")
     best = found[order[0]][1]

@@ -1,4 +1,4 @@
-"""The flow of the remainder as a free function of a signal, beside its law."""
+"""The missing flow as a free function of a signal, to be drawn beside the law that was found."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from thermoctl.diagnosis.law.smooth import Tracked
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 
-SEEN = 0.01  # of the strongest direction of a free function: weaker ones are not drawn
+SEEN = 0.01  # least singular value of a direction of the free function that is drawn, over the largest one
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The remainder's flow over a signal without any form, its sd, and the law, at visited points."""
+    """The missing flow as a free function of a signal, its sd, and the law, at visited values `at` (k,)."""
 
     signal: Signal
     at: np.ndarray
@@ -29,7 +29,7 @@ class Curve:
 def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory, or in a storage. The free function is the law plus a fit of its residual."""
+    None for a law with a memory or of a storage. The free function is the law plus a fit to its residual."""
     found = [s for t in p.terms for s in t.signals]
     if not found or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
@@ -46,7 +46,7 @@ def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None
     line = np.linalg.lstsq(whole, np.concatenate(flows), rcond=None)[0]
     rest = at.target - at.columns(p.place, [q[:, None] for q in flows])[:, 0]
     u, w, v = np.linalg.svd(at.columns(p.place, parts), full_matrices=False)
-    seen = w > SEEN * w[0]  # the rest is the plant's own
+    seen = w > SEEN * w[0]  # the plant's own parameters absorb the others
     noise = max(float(np.mean(rest**2)), 1.0)
     extra = v[seen].T @ ((u.T @ rest)[seen] / w[seen])
     sd = np.sqrt(noise * ((v[seen].T / w[seen]) ** 2).sum(axis=1))

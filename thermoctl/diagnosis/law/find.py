@@ -34,8 +34,8 @@ class FoundLaw:
 
     - `fitted`: the hypothesis with it, and perhaps with effects of the catalogue
     - `gain`: log posterior odds against the best hypothesis without it
-    - `probability`: that something at its place follows its signals
-    - `confirmed`: that it predicts what it was not fitted to (confirm.py)"""
+    - `probability`: posterior probability of a law at its place
+    - `confirmed`: probability that it predicts data that it was not fitted to (confirm.py)"""
 
     placed: PlacedLaw
     fitted: Fitted
@@ -47,22 +47,22 @@ class FoundLaw:
 
     @property
     def proposal(self) -> Proposal:
-        """Its place and terms."""
+        """Return its place and terms."""
         return self.placed.proposal
 
     @property
     def rivals(self) -> tuple[tuple[Proposal, Fitted, float], ...]:
-        """Other laws at its place, with their probability among these."""
+        """Return other laws at its place that fit about as well, each with its refit and its share."""
         return self.placed.rivals
 
     @property
     def share(self) -> float:
-        """Its probability among the laws that fit about as well."""
+        """Return its share of the posterior probability of all laws at its place."""
         return 1.0 - sum(share for _, _, share in self.rivals)
 
     @property
     def rate(self) -> ex.Expr:
-        """Return the law's flow, or the storage with it."""
+        """Return the expression of the law's flow, or of the storage that contains the law."""
         return law_rate(self.fitted)
 
 
@@ -86,16 +86,16 @@ def refits(
     least: float,
     say: Callable[[str], None],
 ) -> list[Tried]:
-    """Refit the proposals, and sums without their least significant term, while more may gain than so far.
+    """Refit the proposals that may beat the best law so far, and sums without an insignificant term.
 
-    `cost`: minus the log prior odds of a law; `least`: log posterior odds below which none is of use.
-    Promises are of first order: all are taken for too small by the largest `ratio` so far."""
+    `cost`: minus the log prior odds of a law; `least`: least useful log posterior odds. A promise is the
+    first-order gain. Every promise is multiplied by the largest ratio so far of a refit's gain to it."""
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
     gain, ratio, leader, left = max(least, 0.0), 1.0, parent, affordable(case, parent)
 
     def wanted(p: Proposal) -> bool:
-        """Return whether a law may still win, and a refit is left for it."""
+        """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
         if not left or case.budget.stopped() or cost(p) + gain > HALF * ratio * p.promise:
             return False

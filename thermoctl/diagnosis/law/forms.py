@@ -1,6 +1,6 @@
 """The library of laws: forms (config/laws.yaml) over signals at a place, written in the plant language.
 
-A term is one form over one or two signals. A signal is divided by its typical size Z, a known parameter
+A term is one form over one or two signals. A signal is divided by its typical size Z, a fixed parameter
 with the signal's unit. So the size A of a term has the unit of the flow."""
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ LAW = "law"  # name of a law among the effects of a hypothesis
 
 @dataclass(frozen=True)
 class Shape:
-    """A parameter of a form beside its size: values to try first, range, unit.
+    """A parameter of a form that is not a size: values to try first, range, unit.
 
-    `of` 'duration': the values are shares of the longest run; 'visited': quantiles of the signal."""
+    With `of` 'duration' the values are shares of the longest recording, with 'visited' quantiles of the
+    signal."""
 
     values: tuple[float, ...]
     range: tuple[float, float]
@@ -37,7 +38,7 @@ class Shape:
     of: str | None = None
 
     def scaled(self, values: Sequence[float], s: Signal | None, duration: float) -> tuple[float, ...]:
-        """Return values, or bounds, as the form counts them."""
+        """Return values, or bounds, in the unit of the form's parameter."""
         if self.of == "duration":
             return tuple(v * duration for v in values)
         if self.of == "visited" and s:
@@ -55,7 +56,7 @@ class Form:
     sizes: tuple[str, ...]
     shapes: Mapping[str, Shape]
     memory: str | None
-    odd: bool  # reverses with its signal
+    odd: bool  # does the term change its sign with its signal?
 
 
 @cache
@@ -93,7 +94,7 @@ def library() -> tuple[Form, ...]:
 
 @dataclass(frozen=True)
 class Term:
-    """A form over signals at values of its shapes. `number` keeps the parameters of several terms apart."""
+    """A form over signals at values of its shapes. The suffix `number` of its parameters counts the terms."""
 
     form: Form
     signals: tuple[Signal, ...]
@@ -103,12 +104,12 @@ class Term:
 
     @property
     def variables(self) -> frozenset[str]:
-        """The signals that it depends on."""
+        """Return the labels of the signals that it depends on."""
         return frozenset(s.label for s in self.signals)
 
     @property
     def reverses(self) -> bool | None:
-        """Return whether the term reverses with what drives the flow; None where nothing demands it."""
+        """Return whether the term reverses with the signal that drives the flow; None if none drives it."""
         return self.form.odd if len(self.signals) == 1 and self.signals[0].drives else None
 
     def expression(self, number: int) -> Expr:
@@ -131,18 +132,18 @@ class Term:
         return ex.div(value, name(scale))
 
     def scales(self, number: int) -> dict[str, Signal]:
-        """Return the known parameters Z1, W1 that hold the signals' typical sizes."""
+        """Return the fixed parameters Z1, W1 with the signals whose typical sizes they hold."""
         used = ex.names(self.expression(number)) | (
             ex.names(self.lagged(number)) if self.form.memory else set()
         )
         return {f"{'ZW'[k]}{number}": s for k, s in enumerate(self.signals) if f"{'ZW'[k]}{number}" in used}
 
     def lagged(self, number: int) -> Expr:
-        """Return what drives the memory of the term."""
+        """Return the input of the term's memory: its first signal without unit."""
         return self.normal(self.signals[0], f"Z{number}")
 
     def filling(self, number: int) -> Expr:
-        """Return the rate of the memory."""
+        """Return the rate of change of the term's memory."""
         known = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
         known |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
         text = ex.parse(MEMORIES[self.form.memory or ""].rate)
@@ -155,11 +156,11 @@ class Term:
 
     @property
     def clock(self) -> dict[str, float]:
-        """Return the times that a memory may count in, s."""
+        """Return the times that the rate of a memory may depend on, s."""
         return {"duration": self.duration, "sample": self.sample}
 
     def values(self, run: Values, t: np.ndarray) -> np.ndarray:
-        """Return the term (N, sizes) along a trajectory, for sizes of one."""
+        """Return the values (N, sizes) of the term along a trajectory, one column for each size at 1."""
         shapes = {q: np.array([v]) for q, v in self.shapes.items()}
         return Family(self.form, self.signals, shapes, self.duration, self.sample).values(run, t)
 
@@ -185,7 +186,7 @@ class Family:
         return Term(self.form, self.signals, shapes, self.duration, self.sample)
 
     def values(self, run: Values, t: np.ndarray) -> np.ndarray:
-        """Return the terms (N, count * sizes) along a trajectory, for sizes of one."""
+        """Return the values (N, count * sizes) of all terms along a trajectory, each size at 1."""
         known: dict[str, Any] = {**self.shapes, "pi": np.pi}
         for symbol, s in zip("zw", self.signals, strict=False):
             value = s.along(run, t)
@@ -205,7 +206,7 @@ class Family:
 def families(
     found: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
 ) -> list[Family]:
-    """Return every form at its first values over the signals found. `every`: possible second signals."""
+    """Return every form at its first values over each signal of `found`. `every`: possible second signals."""
     out = []
     for form in library():
         if form.of == "none":
@@ -216,7 +217,7 @@ def families(
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = _grid(form, z, duration)
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
-    return [f for f in out if f.count]  # a signal of one value has no two thresholds
+    return [f for f in out if f.count]  # a signal with one value only has no two thresholds
 
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
@@ -233,7 +234,7 @@ def _grid(form: Form, z: Signal, duration: float) -> dict[str, np.ndarray]:
 
 
 def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
-    """Return all combinations of values, for each name (k,); two equal thresholds are none."""
+    """Return all combinations of values, by name (k,), without combinations of equal values."""
     if not values:
         return {}
     chosen = [v for v in itertools.product(*values.values()) if len(v) == len(set(v))]
@@ -241,7 +242,7 @@ def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np
 
 
 def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
-    """Return the entry of a law at a place, as the catalogue would hold it."""
+    """Return a law at a place as an entry of the catalogue."""
     changes: list[dict[str, Any]] = []
     parameters: list[EffectParameter] = []
     rate: Expr = ex.ZERO

@@ -1,9 +1,9 @@
 """Memories of a signal z, for laws that depend on its history: nodes of the plant, and values for regression.
 
 - lag: follows z with the time constant tau.
-- total: the integral of z since the start, over the longest run.
-- relay: 1 beyond the threshold `on`, 0 beyond the threshold `off`, between them as before. A thermostat, a
-  siphon. `on` is the upper threshold or the lower one.
+- total: the integral of z since the start, divided by the duration of the longest recording.
+- relay: 1 beyond the threshold `on`, 0 beyond the threshold `off`, unchanged between them, such as a
+  thermostat or a siphon. `on` is the upper threshold or the lower one.
 
 The relay is the non-ideal relay of Visintin, Differential Models of Hysteresis (1994), section I.2. As a node
 it is a trigger with positive feedback (Schmitt, J. Sci. Instrum. 15 (1938) 24):
@@ -11,8 +11,8 @@ it is a trigger with positive feedback (Schmitt, J. Sci. Instrum. 15 (1938) 24):
     dm/dt = ((1 + tanh(6 s + 10 (m - 1/2))) / 2 - m) / sample
     s = (z - (on + off) / 2) / (on - off)
 
-Its two stable states end where ds/dm = 0, at s = 0.505 and -0.505. It switches within a few samples: a
-faster one would look the same. It starts in the middle, and falls to the side where s is."""
+Its two stable states end where ds/dm = 0, at s = 0.505 and -0.505. It switches within a few samples; faster
+switching would not show. It starts at 0.5 and goes to the stable state that s selects."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SignalMemory:
 
     - `rate`: dm/dt, of z, m, the form's shapes, `duration` (of the longest run) and `sample`, s
     - `start`, `start_sigma`: m at the first sample, and its standard deviation
-    - `words`: a description of m
+    - `words`: a description of m for a report
     - `along`: m (N, k) along t (N,) and z (N,), for k values of each shape and a duration"""
 
     rate: str

@@ -23,45 +23,47 @@ from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
-PIECES = 8  # of a free function of a signal
-TRACKED = 20  # nodes with an unknown flow, those that explain the residual best: 24 knots each
-NODES = 4  # of a plant, at which a free flow in time explains most
-SECOND = 10  # signals of a place that may be the second one of a form
-RANKED, COMBINATIONS = 40, 12  # places and signals with the best free function; whose forms are tried
-SEEN = 1e-6  # of the strongest direction of a free function: weaker ones are rounding errors
-POOL = 60  # terms that a sum of terms is built from
-PAIRED = 600  # terms that are tried two at a time
-PAIRS, LIKELY = 24, 50_000  # pairs that explain most energy; best pairs of values that they are looked for in
-GROWN = 8  # pairs of the best score, from which sums of three grow
-PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # the best; of one term; of one term, each of another signal
+PIECES = 8  # number of knots of a free function of a signal
+# Largest number of nodes with an unknown flow, those that explain the residual best: 24 knots each.
+TRACKED = 20
+NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
+SECOND = 10  # number of signals of a place that may be the second one of a form
+RANKED, COMBINATIONS = 40, 12  # (place, signal) pairs whose free function is scored; whose forms are tried
+SEEN = 1e-6  # least singular value over the largest one; smaller ones are rounding errors
+POOL = 60  # number of terms from which sums of terms are built
+PAIRED = 600  # number of terms that are tried two at a time
+PAIRS, LIKELY = 24, 50_000  # number of pairs that are kept; number of best pairs among which they are sought
+GROWN = 8  # number of pairs, those with the best score, to which a third term is added
+PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # number of proposals; of one-term ones first; of those by signal
 TERMS = 3
-ZOOMS, FINE = 2, 9  # finer grids of the shapes of a term; values of each shape there
-CHUNK = 256  # terms whose responses are computed at a time
-KEPT = 20  # values of the shapes of a form over a signal, from which sums may grow
+ZOOMS, FINE = 2, 9  # number of finer grids of the shapes of a term; number of values of each shape in them
+CHUNK = 256  # number of terms whose responses are computed at a time
+KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Terms at a place, their sizes and the gain in log likelihood that the linearised plant promises."""
+    """Terms at a place, their sizes, and the gain in log likelihood that the linearised plant predicts."""
 
     place: Place
     terms: tuple[Term, ...]
     sizes: tuple[float, ...]
     promise: float
     look: float  # log of the number of places, signals and forms that a term was chosen from
-    rare: float  # share of the terms that do not reverse with what drives the flow
+    rare: float  # prior probability of a term that does not reverse with the signal that drives the flow
 
     @property
     def cost(self) -> float:
         """Return minus the log of its prior odds.
 
-        It is one of many laws; a second signal is chosen once more. A flow that a difference or a velocity
-        drives reverses with it: terms that do not share the odds `rare`."""
+        A term is chosen from many places, signals and forms; a second signal adds one more choice. A flow
+        that a difference or a velocity drives usually reverses with it: other terms have the prior
+        `rare`."""
         chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
-        return chosen + float(np.log(2)) * self.shapes + sum(self._surprise(t) for t in self.terms)
+        return chosen + float(np.log(2)) * self.shapes + sum(self._form_cost(t) for t in self.terms)
 
-    def _surprise(self, t: Term) -> float:
-        """Return minus the log of a form's odds over equal odds of all forms."""
+    def _form_cost(self, t: Term) -> float:
+        """Return minus the log of a form's prior over the prior if all forms were equally likely."""
         if t.reverses is None:
             return 0.0
         odd = sum(form.odd for form in library()) / len(library())
@@ -74,12 +76,12 @@ class Proposal:
 
     @property
     def shapes(self) -> int:
-        """Number of parameters beside the sizes."""
+        """Number of parameters that are not sizes."""
         return sum(len(t.form.shapes) for t in self.terms)
 
     @property
     def score(self) -> float:
-        """Promised gain less the cost of the description."""
+        """Predicted gain minus `cost`."""
         return self.promise - self.cost
 
 
@@ -101,7 +103,7 @@ class Found:
 def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal], Tracked]:
     """Return the most promising laws, best first, and the linearised plant. Raises SimulationError.
 
-    `rare`: of `Proposal`."""
+    `rare`: prior probability of a term that does not reverse with the signal that drives the flow."""
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
@@ -129,10 +131,10 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
 
 
 def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
-    """Return the promised gain of a free function of a signal at a place, the best first.
+    """Return the predicted gain of a free function of a signal at each place, the best first.
 
-    Each piece costs half a log of the rows. Only the RANKED with the largest gain in energy are returned: the
-    gain in likelihood takes longer."""
+    Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
+    combinations with the largest gain in energy, and only these are returned."""
     found = []
     for place, s in combos:
         values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
@@ -148,21 +150,21 @@ def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[f
 
 
 def _energy(x: np.ndarray, target: np.ndarray) -> float:
-    """Return the energy of the target that columns explain."""
+    """Return the part of |target|^2 that columns x explain."""
     scale = np.linalg.norm(x, axis=0)
     u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
     return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
 
 
 def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Return straight lines between the knots of a signal (N, knots): the columns of a free function."""
+    """Return hat functions of a signal between knots (N, knots): the columns of a free function."""
     if len(knots) < 2:
         return np.ones((len(v), 1))
     return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
 
 
 def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the gain in log likelihood of these columns at their best sizes, and the sizes."""
+    """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes."""
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
     c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
@@ -198,7 +200,7 @@ def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
 
 
 def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
-    """Return the terms of a family that explain most, without those that look like a constant."""
+    """Return the KEPT terms of a family that explain most, without those that are nearly constant."""
     n = len(f.form.sizes)
     with np.errstate(all="ignore"):
         square = np.einsum("rk,rk->k", x, x)
@@ -213,7 +215,7 @@ def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray
 
 
 def _zoomed(at: Tracked, found: Found) -> Found:
-    """Return a term at better values of its shapes, between its neighbours on a grid that gets finer."""
+    """Return a term with better values of its shapes, searched on finer and finer grids about them."""
     t = found.term
     grid = {q: np.unique(s.scaled(s.values, t.signals[0], t.duration)) for q, s in t.form.shapes.items()}
     for _ in range(ZOOMS if grid else 0):
@@ -228,13 +230,13 @@ def _zoomed(at: Tracked, found: Found) -> Found:
 
 
 def _between(values: np.ndarray, v: float) -> np.ndarray:
-    """Return FINE values between the neighbours of the value nearest to v."""
+    """Return FINE values between the two neighbours of the value nearest to v."""
     k = int(np.argmin(np.abs(values - v)))
     return np.linspace(values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)], FINE)
 
 
 def _varied(pool: Sequence[Found]) -> list[Found]:
-    """Return the best value of the shapes of each form over each signal at each place, at most POOL."""
+    """Return, for each form, signal and place, the term with the best values of its shapes; at most POOL."""
     best: dict[Any, Found] = {}
     for f in pool:
         best.setdefault((f.place, f.kind), f)
@@ -253,9 +255,9 @@ def _proposal(
 def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
     """Return sums of two and three terms at a place.
 
-    Each grows by what another term adds: from the best term, and from the best pairs. A pair may explain much
-    where each of its terms alone does not, because the plant's own parameters imitate it. Terms that do not
-    reverse with what drives the flow are rare: the best pairs without them are tried, too."""
+    Terms are added one by one to the best term, and to the best pairs. A pair may explain much where each of
+    its terms alone does not, because the plant's own parameters imitate it. Terms that do not reverse with
+    the signal that drives the flow are unlikely: so the best pairs without them are tried, too."""
     likely = [f for f in pool if f.term.reverses is not False]
     found = _pairs(at, pool) + (_pairs(at, likely) if len(likely) < len(pool) else [])
     pairs = []
@@ -277,7 +279,7 @@ def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, f
 
 
 def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence[Found]) -> Found | None:
-    """Return the term that explains most of what a sum of terms leaves."""
+    """Return the term that explains most of the residual of a sum of terms; None if none is independent."""
     q, _ = np.linalg.qr(columns)
     rest = at.target - q @ (q.T @ at.target)
     best, most = None, 0.0
@@ -293,7 +295,7 @@ def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence
 
 
 def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
-    """Return the pairs of terms that explain most together, one for each two forms and signals."""
+    """Return the pairs of terms that explain most together, one for each pair of forms with signals."""
     single = [f for f in pool if f.columns.shape[1] == 1][:PAIRED]
     if len(single) < 2:
         return []
@@ -314,7 +316,7 @@ def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
 def _mixed(found: Sequence[Proposal]) -> list[Proposal]:
     """Return laws to refit: the best, the best of one term, one of each signal, then the rest by score.
 
-    Sums promise more than they hold, and the plant may follow a law but badly."""
+    Laws of one term come early, because the predicted gain of sums is often too large."""
     single = [p for p in found if len(p.terms) == 1]
     signal: dict[Any, Proposal] = {}
     for p in single:

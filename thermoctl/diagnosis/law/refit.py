@@ -21,15 +21,16 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.yamlfile import InputError
 
-FEWEST_REFITS = 3  # of a plant of many bodies, see NUMBERS
-SIMPLER = 6  # further refits, of sums of terms without their least significant one
-NUMBERS = 3e7  # that one run of each refit computes, with slopes: so that all refits take less than a minute
-RANGE = 100.0  # times its first size that the size of a term may reach
+FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
+SIMPLER = 6  # number of further refits, of sums without their least significant term
+# Numbers that one run of each refit computes in all, with slopes: about a minute for all refits.
+NUMBERS = 3e7
+RANGE = 100.0  # bound of a term's size, over its first value
 
 
 @dataclasses.dataclass(frozen=True)
 class PlacedLaw(Placed):
-    """A law among the effects of a hypothesis, with its terms; other laws there, and the share of each."""
+    """A law among the effects of a hypothesis. `rivals`: other laws at its place, and the share of each."""
 
     proposal: Proposal
     rivals: tuple[tuple[Proposal, Fitted, float], ...] = ()
@@ -74,7 +75,7 @@ def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Any:
 
 
 def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return the values that a refit starts from, and the ranges of what it moves."""
+    """Return the starting values of a refit, and the ranges of its parameters."""
     values: dict[str, float] = {}
     ranges: dict[str, tuple[float, float]] = {}
     sizes = iter(p.sizes)
@@ -112,7 +113,7 @@ def simpler_law(p: Proposal, f: Fitted) -> Proposal:
 
 
 def affordable(case: Case, parent: Fitted) -> int:
-    """Return how many laws may be refitted: a count of the work, the same on every machine."""
+    """Return the number of refits of laws that NUMBERS allows. It is the same on every machine."""
     rows = sum(len(t) for t in case.tables)
     model = parent.rough.model
     numbers = rows * len(model.states) * (len(model.unknowns) + 1)
@@ -120,7 +121,7 @@ def affordable(case: Case, parent: Fitted) -> int:
 
 
 def law_rate(f: Fitted) -> ex.Expr:
-    """Return the flow, or the storage, of the last law that a hypothesis holds."""
+    """Return the expression of the flow or storage that contains the last law of a hypothesis."""
     law = law_of(f)
     assert law is not None
     own, nodes = set(law.own.values()), law.candidate.place.nodes
@@ -130,7 +131,7 @@ def law_rate(f: Fitted) -> ex.Expr:
 
 
 def at_bound(f: Fitted) -> bool:
-    """Return whether a parameter of the law is at its bound: the form degenerates to a simpler one."""
+    """Return whether a parameter of the law is at its bound: then a simpler form describes it."""
     return bool(set(f.hypothesis.effects[-1].own.values()) & f.fit.at_bound.keys())
 
 

@@ -81,7 +81,7 @@ def _parameters(law: FoundLaw) -> dict[str, Any]:
 
 
 def family(law: FoundLaw) -> list[str]:
-    """Return what the recordings leave open: the exponents within 95 %, and laws that fit about as well."""
+    """Return sentences on laws that the recordings cannot tell apart: intervals of shapes, and rivals."""
     out = []
     c, plant = law.placed.candidate, law.fitted.plant
     for k, t in enumerate(law.proposal.terms, 1):
@@ -137,7 +137,7 @@ def _drawing(law: FoundLaw) -> str:
 
 
 def effect_file(law: FoundLaw) -> dict[str, Any]:
-    """Return the content of an effect file: sizes are fitted again, shapes start at the values found here."""
+    """Return the content of an effect file. Its sizes are refitted, its shapes start at the fitted values."""
     c, plant = law.placed.candidate, law.fitted.plant
     where, swap = _symbols(law, plant)
     parameters: dict[str, Any] = {}
@@ -182,14 +182,14 @@ def effect_file(law: FoundLaw) -> dict[str, Any]:
 def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> dict[str, Any]:
     """Return a change of an effect with the symbols of an effect file."""
 
-    def told(text: str) -> str:
-        """Return an expression with the names that a reader knows."""
+    def in_symbols(text: str) -> str:
+        """Return an expression with the symbols of an effect file."""
         return str(ex.substitute(ex.parse(text), swap))
 
     ((kind, what),) = change.items()
     if isinstance(what, str):
-        return {kind: told(what)}
-    out = {k: told(v) if k in ("rate", "initial") else v for k, v in what.items()}
+        return {kind: in_symbols(what)}
+    out = {k: in_symbols(v) if k in ("rate", "initial") else v for k, v in what.items()}
     return {kind: {k: ends.get(v, v) if k in ("into", "from") else v for k, v in out.items()}}
 
 
@@ -204,7 +204,7 @@ def _ends(where: str) -> dict[str, str]:
 
 
 def _symbols(law: FoundLaw, plant: Plant) -> tuple[str, Any]:
-    """Return the kind of place, and the change of the plant's names to the symbols of an effect file."""
+    """Return the kind of place, and a function that puts symbols of an effect file for the plant's names."""
     place, rig = law.proposal.place, law.placed.candidate.rig
     target, symbols = place.target, dict[str, Expr]()
     where = EVERY

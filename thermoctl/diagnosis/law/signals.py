@@ -13,7 +13,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.units import conversion, dimension
 
-QUANTILES = 21  # of a signal: each 5 %
+QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
 Values = Mapping[str, np.ndarray | float]
 
@@ -31,14 +31,14 @@ class Place:
 
     @property
     def where(self) -> str:
-        """Its name in a result."""
+        """Return its name in a result."""
         if self.part != "flow":
             return f"{self.part} of {self.target}"
         return f"{self.source}-{self.target}" if self.source else self.target
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that it changes."""
+        """Return the nodes that it changes."""
         return (self.source, self.target) if self.source else (self.target,)
 
 
@@ -46,9 +46,9 @@ class Place:
 class Signal:
     """A signal of the plant: an expression, its unit, its typical size.
 
-    `visited`: its evenly spaced quantiles from the smallest to the largest value, over its size.
-    `drives`: a difference or a velocity that drives the flow at its place, and reverses it. `daily`: the time
-    of day, with a day as its size."""
+    `visited`: its evenly spaced quantiles, as (value - centre) / size. `drives`: is it a difference or a
+    velocity that drives the flow at its place, so that the flow reverses with it? `daily`: is it the time of
+    day? Its size then is a day."""
 
     label: str
     value: Expr
@@ -69,9 +69,9 @@ class Signal:
 
 
 def places(rig: Structure) -> list[Place]:
-    """Return the flow into every node that stores something, and between nodes that exchange one; storages.
+    """Return the places of laws: flows into nodes, flows between connected nodes, and storages.
 
-    A storage of 1 is a definition: dn/dt is the sum of the flows."""
+    A position is no such node. A storage of 1 is a definition: dn/dt is the sum of the flows."""
     positions = set(rig.pairs.values())
     flows = rig.physics.flows.values()
     nodes = [
@@ -83,7 +83,7 @@ def places(rig: Structure) -> list[Place]:
 
 
 def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
-    """Return what a law at a place may depend on, each with its typical size over the runs."""
+    """Return the signals that a law at a place may depend on, each with its typical size over the runs."""
     p, out = rig.physics, []
     positions = set(rig.pairs.values())
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]

@@ -2,12 +2,12 @@
 
     y - y(u^) + D u^ = sum_k c_k D phi_k(x^) + S dtheta + noise
 
-u^: flows at all nodes, straight lines between knots, that bring the plant's outputs to the recorded ones.
-D: exact first-order response of the outputs to flows, S: to parameters and initial states. A law at one node
-replaces all of u^. Regression on this equation equals one on the smoothed flow with its covariance.
+u^: flows into all nodes, linear between knots, with which the plant's outputs follow the recorded ones.
+D: exact first-order response of the outputs to flows; S: to parameters and initial states. A law at one node
+replaces all of u^. Regression on this equation equals regression on the smoothed flow with its covariance.
 
-The prior of u^ is white, of one size in units of each node's typical flow. The size has the largest marginal
-likelihood."""
+The prior of u^ is white. Its standard deviation is one multiple of each node's typical flow, the multiple
+with the largest marginal likelihood."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 LATENT = "unknown_flow_into_"
-KNOTS = 240  # of a recording, shared among the nodes
+KNOTS = 240  # number of knots of a recording, shared among the nodes
 FEWEST_KNOTS = 24
-ABSORBED = 1e-3  # share of a flow's response, below which the plant's own parameters absorb it
-STEPS = 3  # Gauss-Newton steps of the tracking
-TOGETHER = 48  # responses that are simulated at a time
-RESOLVED = 400  # hat functions of a flow; 90 % of responses in a stage and in tanks err by less than 0.7 %
+ABSORBED = 1e-3  # a flow is absorbed if the projection leaves less than this share of its response's norm
+STEPS = 3  # largest number of Gauss-Newton steps of the tracking
+TOGETHER = 48  # number of responses that are simulated at a time
+RESOLVED = 400  # number of hat functions of a flow; 90 % of responses in a stage and in tanks err by < 0.7 %
 
 
 @dataclass
 class Tracked:
     """The plant linearised about the tracked trajectory.
 
-    - `metric`: whitened rows there, the plant's own parameters projected out
+    - `metric`: whitened rows at the trajectory, and the projection
     - `target` (rows,): the misfit that a law has to explain
-    - `runs`: every signal of each recording, along the trajectory
-    - `duration`, `sample`: of the longest run, and between samples, s
-    - `explained`: share of the target that a free flow in time into each node explains"""
+    - `runs`: by recording, every signal along the trajectory
+    - `duration`, `sample`: duration of the longest recording, and largest sampling interval, s
+    - `explained`: by node, the share of |target|^2 that a free flow in time into the node explains"""
 
     metric: Rows
     target: np.ndarray
@@ -60,14 +60,14 @@ class Tracked:
 
     @cached_property
     def above(self) -> Callable[[np.ndarray], float]:
-        """By how much the log likelihood of other rows is above that of the target."""
+        """Return a function of other rows: their log likelihood minus that of the target."""
         return self.metric.rise(self.target)
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
-        """Return whitened rows (rows, k), projected, of flows (N, k) at a place by recording.
+        """Return the whitened, projected responses (rows, k) to flows (N, k), by recording, at a place.
 
-        Sums of the responses to RESOLVED hat functions. A storage that is larger by q takes up the flow
-        q dx/dt. A flow that the plant's own parameters absorb gives zeros."""
+        They are sums of the responses to RESOLVED hat functions. A storage that is larger by q acts like the
+        flow -q dx/dt into the node. A flow that the plant's own parameters absorb gives zeros."""
         if place.part == "storage":
             flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
         units = [self._unit(n) for n in reversed(place.nodes)]
@@ -84,9 +84,9 @@ class Tracked:
         return [hat_functions(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
 
     def _slopes(self, node: str) -> list[np.ndarray]:
-        """Return the rate of a node (N,) by recording, without the unknown flow.
+        """Return the slope dx/dt of a node (N,) by recording, without the part of the unknown flow.
 
-        With it a larger storage, less the plant's own parameter of it, would be the unknown flow."""
+        With that part, a law of the storage could reproduce the unknown flow itself."""
         out, storage = [], self.metric.model.plant.nodes[node].storage
         for run, d in zip(self.runs, self.metric.drives, strict=True):
             unknown = run.get(f"{LATENT}{node}", 0.0) / np.asarray(ex.evaluate(storage, run), float)
@@ -94,7 +94,7 @@ class Tracked:
         return out
 
     def _unit(self, node: str) -> list[np.ndarray]:
-        """Return the rows of each recording's responses to hat functions of flow into a node."""
+        """Return, by recording, the rows of the responses to hat functions of flow into a node."""
         if node not in self._units:
             self._units[node] = flow_rows(self.metric, self.runs, node, self._hats, 1.0)
         return self._units[node]
@@ -107,9 +107,9 @@ def flow_rows(
     hats: Sequence[csr_matrix],
     size: float,
 ) -> list[np.ndarray]:
-    """Return the rows of each recording's responses to flows into a node: hats times `size`.
+    """Return, by recording, the rows of the responses to flows into a node: hat functions times `size`.
 
-    TOGETHER at a time, for memory."""
+    To save memory, TOGETHER responses are simulated at a time."""
     blocks, model = [], metric.model
     for r, (d, hat) in enumerate(zip(metric.drives, hats, strict=True)):
         parts, q = [], size * hat.toarray()
@@ -127,8 +127,8 @@ def flow_rows(
 def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
     """Return the plant with a recorded flow into each node.
 
-    Its slope does not change with the storage's parameters. In a plant whose storages and rates may share one
-    factor, this factor would else absorb every flow."""
+    The slope dx/dt that it causes does not change with the storage's parameters. Otherwise, in a plant whose
+    storages and rates are known only up to a common factor, this factor would absorb every flow."""
     inputs = {f"{LATENT}{n}": Input(f"{LATENT}{n}", None, f"{LATENT}{n}", True) for n in nodes}
     rates = {k: ex.mul(name(k), _scaling(plant, k.removeprefix(LATENT))) for k in inputs}
     flows = {k: Flow(k, rate, None, k.removeprefix(LATENT)) for k, rate in rates.items()}
@@ -136,7 +136,7 @@ def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
 
 
 def _scaling(plant: Plant, node: str) -> ex.Expr:
-    """Return a node's storage over its value at the plant's parameters."""
+    """Return a node's storage, divided by its value at the plant's present parameters."""
     known, storage = plant.parameters, plant.nodes[node].storage
     if not ex.names(storage) & known.keys():
         return ex.ONE
@@ -148,8 +148,8 @@ def _scaling(plant: Plant, node: str) -> ex.Expr:
 class _Followed:
     """The plant linearised about the trajectory that follows the recordings best.
 
-    - `misfit`: of each recording, whitened rows of y - y(u^) + D u^
-    - `wide`: of each recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
+    - `misfit`: by recording, whitened rows of y - y(u^) + D u^
+    - `wide`: by recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
 
     metric: Rows
     runs: list[dict[str, np.ndarray | float]]
@@ -160,13 +160,13 @@ class _Followed:
 def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
     """Follow the recordings with unknown flows into nodes. Raises SimulationError.
 
-    The knots of one recording do not touch another one: each is solved alone."""
+    Knots act in their own recording only, so that each recording is solved alone."""
     if not nodes:
         raise SimulationError("the plant has no node that an unknown flow could enter")
     f = as_refitted(case, f)
     plant = with_latent(f.rough_plant, nodes)
     model = compile_plant(plant)
-    # with a law a parameter may leave the bound that the refit without it pressed it to
+    # a parameter that the refit without a law put at its bound may leave it with one
     rough = dataclasses.replace(f.rough, model=model, at_bound={})
     base = dataclasses.replace(f, rough=rough, rough_plant=plant)
     knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
@@ -220,9 +220,9 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
-    """Return the rms of the flow into a node, in its unit, that brings the plant to the recordings.
+    """Return the rms, in the flow's unit, of the unknown flow into a node with which the plant fits.
 
-    `f`: the fitted plant. None where it cannot be tracked."""
+    `f`: the fitted plant. None where it cannot follow the recordings."""
     try:
         runs = _followed(case, f, [node]).runs
     except (SimulationError, np.linalg.LinAlgError):
@@ -250,7 +250,7 @@ def _explained(x: np.ndarray, target: np.ndarray) -> float:
 
 
 def hat_functions(t: np.ndarray, knots: int) -> csr_matrix:
-    """(N, knots) straight lines between evenly spaced knots."""
+    """Return the hat functions (N, knots) of piecewise linear functions between evenly spaced knots."""
     at, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
     k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, knots - 2)
     part = (t - at[k]) / (at[k + 1] - at[k])
@@ -272,18 +272,20 @@ def _wide(
     sizes: Sequence[float],
     hats: Sequence[csr_matrix],
 ) -> list[np.ndarray]:
-    """Return each recording's (rows, nodes * knots) responses to each knot, in units of the typical flows."""
+    """Return, by recording, the responses (rows, nodes * knots) to each knot's flow of typical size."""
     by_node = [flow_rows(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
     return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 
 
 def _smoothed(wide: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the mean of each recording's flows, with the prior size of the largest marginal likelihood."""
+    """Return the posterior mean of the knots' flows by recording, in units of the typical flows.
+
+    The prior's standard deviation has the largest marginal likelihood of SHARES."""
     parts = [np.linalg.svd(x, full_matrices=False) for x in wide]
     along = [u.T @ e for (u, _, _), e in zip(parts, targets, strict=True)]
 
     def score(share: float) -> float:
-        """Twice the log marginal likelihood, up to a constant."""
+        """Return twice the log marginal likelihood at a prior standard deviation, up to a constant."""
         variances = [1 + (share * s) ** 2 for _, s, _ in parts]
         return sum(float(a**2 @ (1 - 1 / v) - np.log(v).sum()) for a, v in zip(along, variances, strict=True))
 

@@ -1,4 +1,4 @@
-"""Why a diagnosis came out as it did, in a screen of lines, from diagnosis.json alone."""
+"""The reasons of a diagnosis in a screen of lines, from diagnosis.json alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import what_next
 
-SHOWN, LOST = 4, 3  # hypotheses; effects that were tried and lost
+SHOWN, LOST = 4, 3  # largest number of hypotheses shown; of effects that were tried and lost
 
 
 def explain(found: Mapping[str, Any]) -> str:
@@ -28,7 +28,7 @@ def explain(found: Mapping[str, Any]) -> str:
 
 
 def why(found: Mapping[str, Any], asked: str) -> str:
-    """Return in one line why an effect, `NAME` or `NAME at PLACE`, is a finding or none."""
+    """Return in one line why an effect, `NAME` or `NAME at PLACE`, is or is not a finding."""
 
     def is_asked(entry: str) -> bool:
         """Return whether an `effect at place` is the one that was asked for."""

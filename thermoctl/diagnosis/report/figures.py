@@ -1,4 +1,4 @@
-"""The numbers of a diagnosis as its texts and tables show them, from diagnosis.json alone.
+"""Numbers of a diagnosis, formatted for texts and tables, from diagnosis.json alone.
 
 Report, terminal and `--explain` read their rows here, so that all of them show the same digits."""
 
@@ -15,9 +15,9 @@ Rows = tuple[tuple[str, ...], Sequence[tuple[str, ...]]]  # heads, rows
 
 NONE = "–"
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
-ALTERNATIVES = 8  # of a result that are listed
-PROMISED = 12  # effects that were not fitted, which are listed
-PLAIN = (1e-3, 1e6)  # values outside are written with a power of ten
+ALTERNATIVES = 8  # largest number of alternatives that are listed
+PROMISED = 12  # largest number of effects without a refit that are listed
+PLAIN = (1e-3, 1e6)  # values outside this range are written with a power of ten
 COLUMNS = {
     "before": "as it came",
     "refit_only": "refitted",
@@ -26,7 +26,7 @@ COLUMNS = {
     "held_out_refit_only": "held out: refitted",
     "held_out_after": "held out: extended",
 }
-RATIOS = ("over_noise", "worth")  # among the numbers that decide; the others are probabilities
+RATIOS = ("over_noise", "worth")  # numbers of a decision that are ratios; the others are probabilities
 MEANINGS = {
     "something": "probability that an effect or an unknown law is missing",
     "known": "probability that an effect is missing that other data confirm",
@@ -42,7 +42,7 @@ MEANINGS = {
 class Output:
     """The numbers of one output, in the unit of its differences. None: not known.
 
-    `errors`: rms by the keys of `fit`; `left`: rms of the remainder; `step`: resolution of the readings"""
+    `errors`: rms errors by the keys of `fit`; `left`: rms of the remainder; `step`: resolution of readings"""
 
     name: str
     unit: str
@@ -80,13 +80,13 @@ class Output:
         """Return an error with its unit; empty where it is not known."""
         return "" if self.errors.get(key) is None else size(self.errors[key], self.unit)
 
-    def change(self, before: str, after: str, told: str = "") -> str:
-        """Return how an error changes, by the digits that are shown. `told`: another text for the first."""
+    def change(self, before: str, after: str, first: str = "") -> str:
+        """Return how an error changes, by the digits that are shown. `first`: a text for the first error."""
         a, b = self.size(before), self.size(after)
         if a == b:
-            return f"stays at {told or a}"
+            return f"stays at {first or a}"
         falls = (self.errors[after] or 0.0) < (self.errors[before] or 0.0)
-        return f"{'falls' if falls else 'rises'} from {told or a} to {b or 'an unknown amount'}"
+        return f"{'falls' if falls else 'rises'} from {first or a} to {b or 'an unknown amount'}"
 
 
 def outputs(found: Result) -> list[Output]:
@@ -107,12 +107,12 @@ def outputs(found: Result) -> list[Output]:
 
 
 def chance(p: float) -> str:
-    """Return a probability in two digits; none is certain."""
+    """Return a probability in two digits, never 0 or 1."""
     return "above 0.99" if p >= 0.995 else "below 0.01" if p < 0.005 else f"{p:.2f}"
 
 
 def refits(done: int, most: int) -> str:
-    """Return the number of refits beside the limit of one search."""
+    """Return the number of refits, with the limit of one search."""
     if done <= most:
         return f"{done} of at most {most} refits"
     return f"{done} refits: a search has {most} at most, and others followed it"
@@ -129,7 +129,7 @@ def size(value: float | None, unit: str) -> str:
 
 
 def with_interval(value: float, sd: float | None) -> str:
-    """Return a value and the half of its 95 % interval, both rounded to two digits of the latter."""
+    """Return a value ± half of its 95 % interval, both rounded to two digits of that half."""
     if not sd or not math.isfinite(sd):
         return f"{value:.4g}"
     half = WIDE * sd
@@ -141,7 +141,7 @@ def with_interval(value: float, sd: float | None) -> str:
 
 
 def short(parameter: str, finding: Result) -> str:
-    """Return a finding's parameter without the effect and the place that end its name."""
+    """Return the name of a finding's parameter without its suffix of effect and place."""
     place = re.sub(r"[^A-Za-z0-9_]", "_", finding["where"])
     return parameter.removesuffix(f"_{finding['effect']}_{place}")
 
@@ -155,7 +155,7 @@ def equation(finding: Result) -> str:
 
 
 def extends(found: Result) -> bool:
-    """Return whether the result is a plant with something that it lacked."""
+    """Return whether the result's plant has an effect or a law more than the original one."""
     return bool(found["findings"] or (found["remainder"] or {}).get("law"))
 
 
@@ -182,7 +182,7 @@ def fit_rows(found: Result) -> Rows:
 
 
 def percent(value: float | None) -> str:
-    """Return a fit in percent with one digit behind the point."""
+    """Return a fit in percent with one decimal."""
     return NONE if value is None else f"{value:.1f}"
 
 
@@ -217,7 +217,7 @@ def parameter_rows(finding: Result) -> Rows:
 
 
 def alternative_rows(found: Result) -> Rows:
-    """Return the alternatives, the likeliest first, with what speaks against them."""
+    """Return the alternatives, the likeliest first, each with the reason why it is not named."""
     rows = [
         (_plain(a["effect"]), a["where"], chance(a["probability"]), a.get("why_not", ""))
         for a in found["alternatives"][:ALTERNATIVES]
@@ -277,7 +277,7 @@ def lost_rows(found: Result) -> Rows:
 
 
 def below(nats: float) -> str:
-    """Return how far a hypothesis is below the result, or above."""
+    """Return by how many nats a hypothesis is below or above the result."""
     return f"{abs(nats):.1f} {'below' if nats >= 0 else 'above'} the result"
 
 

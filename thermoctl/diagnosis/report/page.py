@@ -26,9 +26,10 @@ from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, folded, page, sheet, table, unit
 from thermoctl.safe_file import write_text
 
-SHOWN = 4  # curves beside the first one, those with the largest errors
-MOVED, MOVED_SHARE = 4.0, 0.25  # change of a parameter by a finding that is worth a sentence: sd, share of it
-WORTH = 0.5  # correlation from which it is written into its cell
+SHOWN = 4  # largest number of further curves, those with the largest errors
+# Least change of a parameter by a finding that is reported: in standard deviations, and relative.
+MOVED, MOVED_SHARE = 4.0, 0.25
+WORTH = 0.5  # least correlation whose number is written into its cell
 TONES = {"consistent": "good", "explained": "good", "unexplained": "bad"}
 
 
@@ -58,11 +59,11 @@ def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) 
 
 
 def _ordered(every: Sequence[Curve], rows: Sequence[Output], extended: bool) -> list[Curve]:
-    """Return the curves that are drawn, first the one on which the claim rests, if possible held out."""
+    """Return the curves to draw. The first is of the output that matters most, held out if possible."""
     told = max(rows, key=lambda o: o.gain if extended else o.over("refit_only")).name if rows else ""
 
     def weight(c: Curve) -> tuple[bool, bool, float]:
-        """Return whether it is of the first output, and held out, and how large its error is."""
+        """Return the sort key: is it of that output, is it held out, its error over the noise."""
         noise = next((o.noise for o in rows if o.name == c.output), 0.0) or 1.0
         return c.output == told, c.held_out, (c.rms("refit_only") or 0.0) / noise
 
@@ -193,7 +194,7 @@ def _parameters(found: Diagnosis) -> str:
 
 
 def _estimates(fit: Fit) -> dict[str, Estimate]:
-    """Return the parameters by name; one that differs between recordings is shown for the first."""
+    """Return the estimates by parameter; of one that differs between recordings, that of the first."""
     out: dict[str, Estimate] = {}
     for e in report(_scaled(fit)):
         out.setdefault(e.name, e)
@@ -201,12 +202,12 @@ def _estimates(fit: Fit) -> dict[str, Estimate]:
 
 
 def _scaled(fit: Fit) -> Fit:
-    """Return a fit whose Hessian is scaled to the noise already, for `report`."""
+    """Return the fit with a cost of 0, so that `report` does not scale its Hessian to the noise again."""
     return dataclasses.replace(fit, cost=0.0)
 
 
 def _matrix(fit: Fit) -> str:
-    """Return the correlations of the parameters as a table of tones."""
+    """Return the correlations of the parameters as a table of coloured cells."""
     names = [q for q, _ in fit.unknowns if q in fit.model.active]
     corr = correlations(_scaled(fit))[1][: len(names), : len(names)]
     heads = "".join(f"<th>{k + 1}</th>" for k in range(len(names)))

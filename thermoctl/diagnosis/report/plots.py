@@ -1,4 +1,4 @@
-"""The curves of a report: measured beside simulated, and what of the error remains."""
+"""The figures of a report: measured and simulated curves, and the remaining error."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BROAD, NARROW = 10.0, 3.6  # inches: of a page on a screen, and on a telephone
-POINTS = 200  # buckets of a curve, each drawn by its smallest and its largest value
-DOTS = 300  # measured values that are drawn
-ROOM = 0.15  # of the readings' range above and below them; a simulation further off leaves the picture
-GAP = 8.0  # of the usual step: a longer one is a gap
-FEWEST = 16  # values from which an autocorrelation says something
+BROAD, NARROW = 10.0, 3.6  # widths of a figure in inches: on a screen, and on a telephone
+POINTS = 200  # number of buckets of a curve, each drawn by its smallest and its largest value
+DOTS = 300  # largest number of measured values that are drawn
+ROOM = 0.15  # margin above and below the readings, over their range; simulations outside are cut off
+GAP = 8.0  # a step of time this many times the usual one is a gap in the curve
+FEWEST = 16  # least number of values for an autocorrelation
 SHADES = {"before": GREY, "refit_only": ORANGE, "after": BLUE}
-SCALES = ((2 * 86400.0, 86400.0, "days"), (7200.0, 3600.0, "h"), (0.0, 1.0, "s"))  # from a span, s
+# (least span in s, unit in s, unit).
+SCALES = ((2 * 86400.0, 86400.0, "days"), (7200.0, 3600.0, "h"), (0.0, 1.0, "s"))
 
 
 def compared(c: Curve, caption: str, broad: bool) -> str:
@@ -75,7 +76,7 @@ def remaining(c: Curve, key: str, noise: float, caption: str) -> str:
     white = len(seen) >= FEWEST and float(np.ptp(seen)) > 0
 
     def drawn(width: float, height: float, *panels: int) -> Figure:
-        """Return the panels in rows and columns; `white`: with those of the correlation."""
+        """Return a figure of `panels` (rows, columns): the error, and if `white` its two tests."""
         fig, axes = sheet(width, height, *panels)
         _error(axes[0], c, e, noise)
         if white:
@@ -96,7 +97,7 @@ def _error(axes: Axes, c: Curve, e: np.ndarray, noise: float) -> None:
 
 
 def _dots(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return each point (N,) as a short line and a gap: in SVG a tenth of the size of markers."""
+    """Return each point (N,) as a short line and a gap. In SVG this takes a tenth of the size of markers."""
     ends = ((t, t + 1e-4 * np.ptp(t)), (v, v))
     return tuple(np.column_stack([a, b, np.full(len(a), np.nan)]).ravel() for a, b in ends)
 

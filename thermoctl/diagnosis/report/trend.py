@@ -1,11 +1,11 @@
-"""Does an effect grow? Its size in each recording, against the recordings' dates.
+"""Trend of an effect: its size in each recording, and a straight line over the recordings' dates.
 
-At the joint refit, recording r alone pulls on the effect's size with gradient g and curvature h. Its own
-initial states are eliminated, the plant's other parameters stay at the joint refit. So its own size is
+Recording r alone has gradient g and curvature h by the effect's size, at the joint refit. Its own initial
+states are eliminated, the plant's other parameters stay at the joint refit. So the size in recording r is
 
     joint size + g / h,   standard deviation 1 / sqrt(h)
 
-A straight line over the dates gives the change a month.
+The slope of a straight line over the dates is the change a month.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from thermoctl.yamlfile import InputError
 def trends(
     case: Case, f: Fitted, shown: Sequence[Placed], before: Sequence[Mapping[str, Any]] = ()
 ) -> list[dict[str, Any]]:
-    """Return the sizes of the effects by recording, and each size's change a month, as the result holds them.
+    """Return `trends` of the result: each effect's size by recording, and its change a month.
 
     `before`: the trends of an earlier diagnosis, whose recordings come first."""
     posterior = Posterior(case, f.plant, f.hypothesis.effects)
@@ -86,7 +86,8 @@ def earlier_trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
         ]
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as e:  # no JSON, or not what the engine wrote
+    # No JSON, or other content than a diagnosis writes.
+    except (ValueError, KeyError, TypeError, AttributeError) as e:
         raise InputError(
             f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
             "recordings again"
@@ -104,8 +105,8 @@ def _read_size(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
 
 
-def told(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the trends that are significant, as sentences."""
+def trend_notes(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence for each significant trend."""
     return [
         f"{t['effect']} at {t['where']} changes with the recordings' dates: {t['parameter']} by {t['per_month']:+.3g} "
         f"± {1.96 * t['per_month_sd']:.2g} {t['unit'] or ''} in 30 days, {_day(t['recordings'][0])} to "
@@ -120,7 +121,7 @@ def _day(recording: Mapping[str, Any]) -> str:
 
 
 def _sizes(posterior: Posterior, f: Fitted, parameter: str) -> list[tuple[float, float]]:
-    """Return (value, standard deviation) of a parameter in each recording, infinite where it says nothing."""
+    """Return (value, sd) of a parameter in each recording; sd is infinite without information on it."""
     problem, z = posterior.problem, f.fit.z
     index = posterior.model.parameters.index(parameter)
     errors = posterior.errors(z)

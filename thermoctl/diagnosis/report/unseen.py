@@ -1,4 +1,4 @@
-"""Detection limits: the smallest size of each effect that recordings show, beside a refit of the plant.
+"""Detection limits: the smallest size of each effect that would show in the recordings after a refit.
 
     smallest = SEEN |p(s) - p(0)|,   s = 1 / |d'|
 
@@ -27,10 +27,11 @@ from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Norms, directions, groups_of
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 
-SEEN = 5.0  # standard errors of an effect's size, from which it would have been seen
-ABSORBED = 1e-4  # share of a direction that is left, below which the plant's own parameters imitate it
-STILL = 1e-9  # norm of a whitened direction, below which nothing moves
-SIZES = {"times", "lags", "delays", "small_levels"}  # shapes that are a size: absent at 0
+SEEN = 5.0  # an effect shows if its size is this many standard errors
+ABSORBED = 1e-4  # an effect is imitated if the projection leaves less than this share of its direction's norm
+STILL = 1e-9  # an effect is not excited if its whitened direction has a smaller norm
+# Kinds of shapes that are a size: at 0 there is no effect.
+SIZES = {"times", "lags", "delays", "small_levels"}
 NOT_EXCITED = "these inputs do not excite it"
 IMITATED = "the plant's own parameters imitate it"
 TOO_LARGE = "its largest size would not show"
@@ -38,10 +39,10 @@ TOO_LARGE = "its largest size would not show"
 
 @dataclass(frozen=True)
 class Visible:
-    """The smallest size of an effect at a place that would show; `reason`: why none would.
+    """The smallest size of an effect at a place that would show; `reason`: why no size would.
 
-    `moves`: the output that this size moves most beside its span, the rms of that before any refit, and its
-    share of the span."""
+    `moves`: the output that this size changes most relative to its span, the rms change before a refit, and
+    that rms over the span."""
 
     candidate: Candidate
     parameter: str
@@ -51,7 +52,7 @@ class Visible:
     moves: tuple[str, float, float] | None = None
 
     def entry(self) -> dict[str, Any]:
-        """Return it as the results' `not_seen` lists it."""
+        """Return the entry of `not_seen` in diagnosis.json."""
         effect, where = self.candidate.key
         smallest = float(f"{self.smallest:.4g}")
         return {
@@ -64,7 +65,7 @@ class Visible:
 
 
 def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
-    """Return by effect and place the smallest size that would have been seen, in the parameter's unit."""
+    """Return `not_seen` of a result: the smallest size of each effect that would have shown."""
     null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
     norms = [n for n in found.searched.norms if sized(n.column.item[0].effect)]
     seen = _best((n, None) for n in norms) if norms else visible(found.case, null, found.null.average)
@@ -84,11 +85,11 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
 
 
 Rms = Mapping[str, tuple[float, float]]
-"""By output the rms change by a direction at s = 1, and the output's span."""
+"""By output, the rms change that a direction causes at s = 1, and the output's span."""
 
 
 def sized(effect: Effect) -> bool:
-    """Return whether an effect has a size. A limit of a drive, a reading or a level has none."""
+    """Return whether an effect has a size that can be small. A limit of a drive or of a reading has none."""
     return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
 
 
@@ -111,7 +112,7 @@ def _moves(rms: Rms, times: float) -> tuple[str, float, float]:
 
 
 def _times(column: Column, left: float) -> float:
-    """Return the multiple of the direction at s = 1 that is the smallest visible size."""
+    """Return the smallest visible size as a multiple of the direction's size at s = 1."""
     sized_ = any(p.amplitude for p in column.item[0].effect.parameters)
     return SEEN / left if sized_ else max(SEEN / left, 1 / NEAR)
 
@@ -134,7 +135,7 @@ def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) ->
 
 
 def _energies(metric: Rows, plain: np.ndarray) -> dict[int, np.ndarray]:
-    """Return by output the sum of squares of rows (rows, k), not whitened: (k,)."""
+    """Return the sum of squares (k,) of rows (rows, k), not whitened, by output."""
     found: dict[int, np.ndarray] = {}
     at = 0
     for c in metric.plain.coordinates.channels:
@@ -156,13 +157,13 @@ def _visible(column: Column, full: float, left: float) -> Visible:
         p = next(p for p in sizes if found[p.name] != absent[p.name])
         smallest, most = abs(found[p.name] - absent[p.name]), max(abs(np.array(c.bounds(p)) - absent[p.name]))
         return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if smallest > most else None)
-    # A lag, delay or dead zone: near a value on the grid the outputs change in proportion to it.
+    # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
     p = next(p for p in c.effect.parameters if p.shape)
     smallest = column.item[2][0][str(p.shape)] * max(SEEN / left, 1 / NEAR)
     return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if left < SEEN else None)
 
 
 def _unit(c: Candidate, parameter: str) -> str | None:
-    """Return a parameter's unit for people: K/s, and not (K)/s."""
+    """Return a parameter's unit without needless brackets: K/s, not (K)/s."""
     unit = c.extend({}).parameters[c.own(parameter)].unit
     return re.sub(r"\(([^()*/ ]+)\)", r"\1", unit) if unit else unit

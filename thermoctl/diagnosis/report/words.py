@@ -1,6 +1,6 @@
-"""A diagnosis in a few sentences, by size, from diagnosis.json alone.
+"""A diagnosis in a few sentences, from diagnosis.json alone.
 
-A sentence chooses its words from the numbers that it shows, as they are rounded there (`figures`)."""
+The words of a sentence depend on the numbers in it as they are shown, rounded (`figures`)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ NEXT = {
 }
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
-LIKELY = 0.05  # probability from which an effect beside a consistent plant is worth a word
-LARGER = 1.1  # errors over the sensors' noise, from which an agreement says how much larger they are
-NOT_RANDOM = 0.5  # probability of a remainder, from which one that is smaller than the noise is named
+LIKELY = 0.05  # least probability of an effect that is mentioned with the verdict `consistent`
+LARGER = 1.1  # least error over the noise that is stated with the verdict `consistent`
+NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 
 
 def words(found: Result) -> str:
@@ -62,7 +62,7 @@ def what_next(found: Result) -> str:
 
 
 def name(finding: Result) -> str:
-    """Return an effect and its place; with its time, where it has one."""
+    """Return an effect and its place as text, with its duration or its times if it has any."""
     text = str(finding["effect"]).replace("_", " ")
     parameters = list(finding.get("parameters", {}).values())
     if len(parameters) == 1 and parameters[0]["unit"] == "s":
@@ -75,12 +75,12 @@ def name(finding: Result) -> str:
 
 
 def listed(items: Sequence[str]) -> str:
-    """Return `a, b and c`."""
+    """Join items as `a, b and c`."""
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
 def law_sentence(entry: Result | None) -> str:
-    """Return the law of the remainder."""
+    """Return a sentence on the law of the remainder; '' without one."""
     if not entry:
         return ""
     values = ", ".join(
@@ -139,7 +139,7 @@ def _found(found: Result, rows: Sequence[Output]) -> str:
 
 
 def _families(found: Result) -> list[str]:
-    """Return sentences on effects that imitate each other, beside others."""
+    """Return a sentence for each family of effects that imitate each other, unless `_found` has it."""
     known = {(a["effect"], a["where"]) for a in (*found["findings"], *found["alternatives"])}
     return [
         f"One of these is there (probability {chance(f['probability'])}): {' or '.join(map(name, f['effects']))}."
