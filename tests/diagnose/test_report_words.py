@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from thermoctl.diagnosis.commands import summary
 from thermoctl.diagnosis.curves import Curve
-from thermoctl.diagnosis.data.case import Budget, told
+from thermoctl.diagnosis.data.case import Budget, outlier_note
 from thermoctl.diagnosis.report.explain import explain
 from thermoctl.diagnosis.report.figures import (
     chance,
@@ -272,12 +272,12 @@ def test_what_lost_says_why_and_on_which_side_of_the_result():
 
 def test_a_note_is_told_once_and_outliers_with_their_places():
     assert merged(["a", "b", "a", "a"]) == ["a (3 times)", "b"]
-    text = told((("run_1", "T", (1.0, 2.5)), ("run_2", "T", tuple(range(9)))))
+    text = outlier_note((("run_1", "T", (1.0, 2.5)), ("run_2", "T", tuple(range(9)))))
     assert (
         text
         == "11 single outliers were left out: T in run_1 at 1, 2.5 s; T in run_2 at 0, 1, 2, 3, 4, 5 and 3 more s"
     )
-    assert told((("run_1", "T", (1.0,)),)).startswith("1 single outlier was left out")
+    assert outlier_note((("run_1", "T", (1.0,)),)).startswith("1 single outlier was left out")
 
 
 def test_a_parameter_is_shown_without_its_place():
