@@ -10,9 +10,7 @@ import os
 
 os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
 import contextlib  # noqa: E402
-import ctypes  # noqa: E402
 import io  # noqa: E402
-import subprocess  # noqa: E402
 import sys  # noqa: E402
 import tempfile  # noqa: E402
 import time  # noqa: E402
@@ -24,10 +22,10 @@ from pathlib import Path  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy import linalg  # noqa: E402
 
-from tests.identify.peers import identify_validated, time_constant_s  # noqa: E402
-from thermoctl.identify import expansion, kernels, modal, subspace  # noqa: E402
+from tests.identify.peers import identify_validated, initial_state, time_constant_s  # noqa: E402
+from tests.reproduction import paper  # noqa: E402
+from thermoctl.identify import expansion, kernels, modal  # noqa: E402
 from thermoctl.identify.statespace import StateSpace  # noqa: E402
-from thermoctl.yamlfile import InputError  # noqa: E402
 
 warnings.filterwarnings("ignore")
 MISSED: list[str] = []
@@ -136,36 +134,12 @@ def slicot(u: np.ndarray, y: np.ndarray, n: int = 12, i: int = 20, refine: bool 
     return np.array(a), np.array(b), np.array(c)
 
 
-def sippy(u: np.ndarray, y: np.ndarray):
-    from sippy_unipi import system_identification
-
-    with contextlib.redirect_stdout(io.StringIO()):
-        m = system_identification(y.T, u.T, "N4SID", SS_fixed_order=12, SS_f=20, SS_p=20, SS_D_required=False)
-    return m.A, m.B, m.C
-
-
 def ipsid(u: np.ndarray, y: np.ndarray):
     import PSID
 
     with contextlib.redirect_stdout(io.StringIO()):
         m = PSID.IPSID(y, U=u, nx=12, n1=0, i=20)
     return m.A, m.B, m.C
-
-
-def nfoursid(u: np.ndarray, y: np.ndarray):
-    import pandas
-    from nfoursid.nfoursid import NFourSID
-
-    names = [f"y{j}" for j in range(y.shape[1])]
-    m = NFourSID(
-        pandas.DataFrame(np.hstack([u, y]), columns=["u", *names]),
-        output_columns=names,
-        input_columns=["u"],
-        num_block_rows=13,
-    )
-    m.subspace_identification()
-    s, _ = m.system_identification(rank=12)
-    return s.a, s.b, s.c
 
 
 def error(model, u: np.ndarray, truth: np.ndarray) -> float:
@@ -190,50 +164,19 @@ def models() -> None:
     uv = (6.0 * ((tv % 900) < 500) * (tv < 4500))[:, None]
     yv = free_run(1.0, uv)
     noisy = [y + 0.1 * np.random.default_rng(s).standard_normal(y.shape) for s in range(8)]
-    ours, _ = cpu(lambda: subspace.identify(u, noisy[0], 1.0, 12, 20, "cva"), 7)
-    theirs, _ = cpu(lambda: slicot(u, noisy[0]), 7)
-    goal(
-        "subspace CPU / ctrlsys N4SID + ib01cd (n 12, i 20, 15 000 x 13)",
-        ours / theirs,
-        0.6,
-        f"{1e3 * ours:.0f} / {1e3 * theirs:.0f} ms",
-    )
     peers = {
         "ctrlsys + ib01cd, i 20": slicot,
         "ctrlsys + ib01cd, i 30": lambda u, y: slicot(u, y, 12, 30),
         "ctrlsys + ib01cd, n 8": lambda u, y: slicot(u, y, 8, 20),
     }
-    for name, run in (("sippy N4SID", sippy), ("PSID", ipsid)):
-        try:
-            t, m = cpu(lambda run=run: run(u, noisy[0]))
-        except Exception as e:  # noqa: BLE001  a peer that does not run is reported, not hidden
-            print(f"    {name}: does not run here: {type(e).__name__}: {str(e)[:90]}")
-            continue
-        goal(
-            f"subspace CPU / {name}", ours / t, 0.05, f"{1e3 * t:.0f} ms, its error {error(m, uv, yv):.4f} K"
-        )
-        if name == "PSID":
-            peers[name] = run
-    # nfoursid forms an N x N matrix (3.5 GB and 51 s for 15 000 samples): the same hours at 5 s a sample instead
-    v = block_mean(noisy[0], 5)
-    slow_u = block_mean(u, 5)
-    t, m = cpu(lambda: nfoursid(slow_u, v))
-    ours, _ = cpu(lambda: subspace.identify(slow_u, v, 5.0, 12, 13, "cva"), 3)
-    resampled = StateSpace(*(np.asarray(a) for a in m), 5.0, np.zeros(12))
     try:
-        its = f"{error(resampled.resample(1.0), uv, yv):.4f} K"
-    except InputError:
-        its = "not told: no real logarithm"
-    goal(
-        "subspace CPU / nfoursid (3000 x 13)",
-        ours / t,
-        0.05,
-        f"{1e3 * ours:.0f} / {1e3 * t:.0f} ms, its error {its}",
-    )
+        ipsid(u, noisy[0])
+        peers["PSID"] = ipsid
+    except Exception as e:  # noqa: BLE001  a peer that does not run is reported, not hidden
+        print(f"    PSID: does not run here: {type(e).__name__}: {str(e)[:90]}")
     found = {k: [run(u, v) for v in noisy] for k, run in peers.items()}
     found["ours, real poles"] = [modal.identify(modal.reduce((u, v), 1.0), 8) for v in noisy]
-    found["ours, CVA"] = [subspace.identify(u, v, 1.0, 12, 20, "cva") for v in noisy]
-    found["the paper's (26)"] = [subspace.identify(u, v, 1.0, 12, 20, "paper") for v in noisy]
+    found["the paper's (26)"] = [paper.n4sid(u, v, 1.0) for v in noisy]
     e = {k: [error(m, uv, yv) for m in v] for k, v in found.items()}
     for k, v in e.items():
         print(
@@ -329,7 +272,7 @@ def output_error() -> None:
         rises_in, read_in = measured[:7200], read[:7200]
         sigma = np.sqrt(0.25**2 / 12 + 0.07**2)
         bank = expansion.Bank(12, 1.0)
-        spent["recursion (5)"], m5 = cpu(partial(expansion.recursive, rises_in, read_in, 1.0))
+        spent["recursion (5)"], m5 = cpu(partial(paper.recursion, rises_in, read_in, 1.0))
         spent["output error"], mo = cpu(partial(expansion.output_error, rises_in, read_in, 1.0, sigma))
         spent["bank"], _ = cpu(partial(bank.update, rises_in, read_in))
         for name, m in (("recursion (5)", m5), ("output error", mo), ("bank", bank.model())):
@@ -352,81 +295,6 @@ def output_error() -> None:
         r["bank"] / r["recursion (5)"],
         0.15,
         f"{1e3 * r['bank']:.1f} nm, {1e6 * spent['bank'] / 7200:.1f} us a sample",
-    )
-
-
-C_SOURCE = r"""
-double rls(double*th,double*q,const double*f,double y,double lam,double*g,int n){double d=lam,e=y;
- for(int i=0;i<n;i++){double s=0;for(int j=0;j<n;j++)s+=q[i*n+j]*f[j];g[i]=s;d+=f[i]*s;e-=f[i]*th[i];}
- for(int i=0;i<n;i++){double k=g[i]/d;th[i]+=k*e;for(int j=0;j<n;j++)q[i*n+j]=(q[i*n+j]-k*g[j])/lam;}return e;}
-void rls_all(double*th,double*q,const double*f,const double*y,double lam,double*g,int n,int N){
- for(int k=0;k<N;k++)rls(th,q,f+(long)k*n,y[k],lam,g,n);}
-"""
-
-
-def steps() -> None:
-    rng = np.random.default_rng(0)
-    n, p = 20000, 25
-    f, y = rng.standard_normal((n, p)), rng.standard_normal(n)
-    ours, _ = cpu(lambda: kernels.rls_run(np.zeros(p), 1e3 * np.eye(p), f, y, 0.9999), 5)
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "s.c").write_text(C_SOURCE)
-        subprocess.run(["cc", "-O3", "-shared", "-fPIC", "-o", f"{folder}/s.so", f"{folder}/s.c"], check=True)
-        lib = ctypes.CDLL(f"{folder}/s.so")
-        d = ctypes.POINTER(ctypes.c_double)
-
-        def plain() -> None:
-            th, q, g = np.zeros(p), 1e3 * np.eye(p), np.zeros(p)
-            lib.rls_all(
-                *(v.ctypes.data_as(d) for v in (th, q, f, y)),
-                ctypes.c_double(0.9999),
-                g.ctypes.data_as(d),
-                p,
-                n,
-            )
-
-        c, _ = cpu(plain, 5)
-    import padasip
-
-    theirs, _ = cpu(lambda: padasip.filters.FilterRLS(n=p, mu=0.9999).run(y[:4000], f[:4000]))
-    goal(
-        "RLS step, 25 parameters / padasip in a loop",
-        (ours / n) / (theirs / 4000),
-        0.03,
-        f"{1e6 * ours / n:.2f} / {1e6 * theirs / 4000:.1f} us; plain C {1e6 * c / n:.2f} us",
-    )
-    from filterpy.kalman import KalmanFilter
-
-    a, b = plant(1.0)
-    k = KalmanFilter(dim_x=12, dim_z=1, dim_u=1)
-    k.F, k.B, k.H = a, b, np.eye(1, 12)
-    z = rng.standard_normal(2000)
-
-    def peer() -> None:
-        for v in z:
-            k.predict(u=np.array([[1.0]]))
-            k.update(v)
-
-    theirs, _ = cpu(peer)
-    poles = np.exp(-1 / np.geomspace(15, 4000, 12))
-    u, big = np.ones((200_000, 1)), rng.standard_normal(200_000)
-    ours, _ = cpu(
-        lambda: kernels.steady_filter_modal(
-            poles, np.ones((12, 1)), np.ones(12), 0.01 * np.ones(12), np.zeros(12), u, big
-        ),
-        3,
-    )
-    dense, _ = cpu(
-        lambda: kernels.steady_filter(
-            a, b, np.eye(1, 12), 0.01 * np.ones((12, 1)), np.zeros(12), u, big[:, None]
-        ),
-        3,
-    )
-    goal(
-        "steady-state filter, 12 states, modal / filterpy",
-        (ours / 2e5) / (theirs / 2000),
-        0.005,
-        f"{1e6 * ours / 2e5:.3f} / {1e6 * theirs / 2000:.0f} us; dense {1e6 * dense / 2e5:.3f} us",
     )
 
 
@@ -476,7 +344,7 @@ def measured_data() -> None:
         cut = int(0.6 * len(u))
 
         def left(m, start: int, stop: int, x0=None, u=u, y=y) -> np.ndarray:
-            x0 = m.initial_state(u[:start], y[:start]) if x0 is None else x0
+            x0 = initial_state(m, u[:start], y[:start]) if x0 is None else x0
             with np.errstate(over="ignore", invalid="ignore"):
                 return m.simulate(u[:stop], x0)[start:] - y[start:stop]
 
@@ -583,7 +451,6 @@ def slicot_mimo(u: np.ndarray, y: np.ndarray, n: int, i: int):
 
 
 if __name__ == "__main__":
-    steps()
     output_error()
     models()
     measured_data()

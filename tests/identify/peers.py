@@ -7,9 +7,8 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from scipy import linalg
 
-from thermoctl.identify import expansion, modal
+from thermoctl.identify import modal
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
@@ -20,12 +19,15 @@ def time_constant_s(model: Expansion) -> float:
     return -model.period_s / np.log(model.f1) if 0 < model.f1 < 1 else 0.0
 
 
-def block_ls(rises: np.ndarray, y: np.ndarray, period_s: float) -> Expansion:
-    """Equation-error block least squares: the measured y in the regressor."""
-    phi = np.hstack([expansion.regressors(rises)[:-1], y[:-1, None]])
-    theta = linalg.lstsq(phi, y[1:], cond=1e-10)[0]
-    m = rises.shape[1]
-    return Expansion(float(theta[-1]), theta[:m], theta[m : 2 * m], period_s)
+def initial_state(m: StateSpace, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Least-squares x0 (n,) of a free run over u (N, m) for y (N, l); NaN in y is left out."""
+    still = np.zeros_like(u)
+    columns = np.stack([m.simulate(still, e) for e in np.eye(m.order)], axis=-1)
+    here = np.isfinite(y)
+    f, left = columns[here], (y - m.simulate(u))[here]
+    d = np.linalg.norm(f, axis=0)
+    # slow states are nearly collinear over a short record: a ridge keeps them small
+    return np.linalg.solve(f.T @ f / d / d[:, None] + 1e-5 * np.eye(m.order), f.T @ left / d) / d
 
 
 def fit_percent(y: np.ndarray, model: np.ndarray) -> np.ndarray:
@@ -69,7 +71,7 @@ def identify_validated(
             except InputError:
                 total = np.inf
                 break
-            x0 = m.x0 if choice[1] else m.initial_state(u[:start], y[:start])
+            x0 = m.x0 if choice[1] else initial_state(m, u[:start], y[:start])
             total += float(np.nanmean((m.simulate(u[:stop], x0)[start:] - y[start:stop]) ** 2))
         if np.isfinite(total):
             errors[choice] = float(np.sqrt(total / len(folds)))

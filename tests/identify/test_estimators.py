@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import yaml
-from scipy import linalg, signal
+from scipy import signal
 
-from tests.identify.peers import block_ls, time_constant_s
+from tests.identify.peers import time_constant_s
+from tests.reproduction import paper
 from tests.reproduction.sensors import choose_sensors
 from thermoctl.control.model import CompensatorModel, zero_model
-from thermoctl.identify import expansion, filter, kernels, modelfile, online, tuning
+from thermoctl.identify import expansion, filter, modelfile, online, tuning
 from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
@@ -26,17 +27,10 @@ def motion(n=9000, seed=0):
     return rises, y, rng
 
 
-def test_recursion_equals_block_least_squares():
-    rises, y, rng = motion(3000)
-    rises, y = rises + 0.05 * rng.standard_normal(rises.shape), y + 0.05 * rng.standard_normal(len(y))
-    a, b = block_ls(rises, y, 1.0), expansion.recursive(rises, y, 1.0, q0=1e9)
-    assert np.allclose(np.concatenate([a.b1, a.b2, [a.f1]]), np.concatenate([b.b1, b.b2, [b.f1]]), atol=1e-5)
-
-
 def test_equation_error_is_biased_and_output_error_is_not():
     rises, y, rng = motion()
     read = y + 0.1 * rng.standard_normal(len(y))
-    biased, true = expansion.recursive(rises, read, 1.0), expansion.output_error(rises, read, 1.0)
+    biased, true = paper.recursion(rises, read, 1.0), expansion.output_error(rises, read, 1.0)
     assert time_constant_s(biased) < 30
     assert abs(time_constant_s(true) - 120) < 15
     left = [np.std((y - m.predict(rises))[2000:]) for m in (biased, true)]
@@ -77,26 +71,6 @@ def test_bank_online_comes_near_the_block_fit_and_misses_samples():
     assert np.std((y - m.predict(rises))[2000:]) < 0.1
 
 
-def test_square_root_rls_equals_least_squares():
-    rng = np.random.default_rng(0)
-    rows = rng.standard_normal((400, 6))
-    r = np.zeros((5, 6))
-    r[np.arange(5), np.arange(5)] = 1e-9
-    kernels.triangle_run(r, rows, 1.0)
-    theta = linalg.solve_triangular(r[:, :5], r[:, 5])
-    assert np.allclose(theta, np.linalg.lstsq(rows[:, :5], rows[:, 5], rcond=None)[0], atol=1e-10)
-
-
-def test_rls_forgets():
-    rng = np.random.default_rng(0)
-    f, y = rng.standard_normal((300, 4)), rng.standard_normal(300)
-    a, qa = np.zeros(4), 1e3 * np.eye(4)
-    kernels.rls_run(a, qa, f, y, 0.98)
-    weight = 0.98 ** np.arange(299, -1, -1.0)
-    normal = (f * weight[:, None]).T @ f
-    assert np.allclose(a, np.linalg.solve(normal, (f * weight[:, None]).T @ y), atol=1e-3)
-
-
 def thermal():
     p = np.exp(-1 / np.array([30.0, 300.0, 2000.0]))
     return StateSpace(
@@ -106,30 +80,6 @@ def thermal():
         1.0,
         np.zeros(3),
     )
-
-
-def test_mkf_is_the_printed_recursion():
-    """(34), (35) written out in numpy."""
-    m, rng = thermal(), np.random.default_rng(0)
-    u = (np.arange(600) % 200 < 90).astype(float)[:, None]
-    y = m.simulate(u) + 0.2 * rng.standard_normal((600, 3)).cumsum(0) / 10
-    f = filter.mkf(m, u, y, 0.01, 1.0)
-    e = y - m.simulate(u)
-    z = e - e.mean(0)
-    assert np.allclose(f.zeta, (z[:, :1] * z).mean(0) / (z[:, 0] ** 2).mean())
-    coil = y[:, 0].copy()
-    coil[5:9] = np.nan
-    got, gains = f.run(u[:, 0], coil)
-    x, p = np.zeros(3), f.r_w
-    for k in range(600):
-        if np.isfinite(coil[k]):
-            gain = p / (p + f.r_v)
-            p = p * (1 - gain)
-            x = x + gain * (coil[k] - x[0]) * f.zeta
-            assert gains[k] == pytest.approx(gain)
-        assert np.allclose(got[k], x)
-        x = f.alpha @ x + f.beta[:, 0] * u[k, 0]
-        p = f.alpha[0] @ f.alpha[0] * p + f.r_w
 
 
 def test_steady_filter_is_where_the_kalman_recursion_ends():

@@ -1,13 +1,13 @@
-"""Thermal models: subspace, real poles, resampling, against closed forms and a simulator of known truth."""
+"""Thermal models: real poles, resampling, against closed forms and a simulator of known truth."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import linalg, signal
+from scipy import signal
 
-from tests.identify.peers import fit_percent, identify_validated
-from thermoctl.identify import modal, subspace
+from tests.identify.peers import identify_validated, initial_state
+from thermoctl.identify import modal, refine
 from thermoctl.identify.statespace import StateSpace
 from thermoctl.yamlfile import InputError
 
@@ -37,56 +37,6 @@ def test_simulation_is_that_of_scipy():
     m, u = truth(), pulses(300)
     reference = signal.dlsim((m.a, m.b, m.c, np.zeros((4, 1)), 1.0), u)[1]
     assert np.allclose(m.simulate(u), reference, atol=1e-12)
-
-
-def test_gram_is_the_hankel_matrix_squared_whatever_the_pieces(data):
-    u, _, y = data
-    u, y, i = u[:700], y[:700], 4
-    z = np.hstack([u, y])
-    hankel = (
-        np.lib.stride_tricks.sliding_window_view(z, 2 * i, axis=0)
-        .transpose(0, 2, 1)
-        .reshape(700 - 2 * i + 1, -1)
-    )
-    whole = subspace.correlate((u, y), 1.0, i).gram
-    cuts = [0, 3, 5, 40, 333, 700]
-    pieces = subspace.correlate([(u[a:b], y[a:b]) for a, b in zip(cuts, cuts[1:], strict=False)], 1.0, i).gram
-    assert np.allclose(whole, hankel.T @ hankel, rtol=1e-11)
-    assert np.allclose(pieces, whole, rtol=1e-11)
-
-
-@pytest.mark.parametrize("weighting", ["n4sid", "moesp", "cva"])
-def test_subspace_finds_poles_and_response(data, weighting):
-    u, y, noisy = data
-    m = subspace.identify(u, noisy, 1.0, 3, 20, weighting)
-    assert m.stable and fit_percent(y, m.simulate(u)).min() > 99
-    assert abs(m.time_constants_s[0] / TAU[2] - 1) < 0.05
-
-
-def test_the_papers_input_matrix_is_exact_without_noise_and_worse_with_it():
-    """(26) is consistent: with a rich input and hardly any noise it finds B; with pulses and noise simulation least squares is better."""
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal((4000, 1))
-    y = truth().simulate(u)
-    m = subspace.identify(u, y + 1e-6 * rng.standard_normal(y.shape), 1.0, 3, 10, "paper")
-    assert fit_percent(y, m.simulate(u)).min() > 99
-    u = pulses()
-    y = truth().simulate(u)
-    noisy = y + 0.05 * rng.standard_normal(y.shape)
-    error = {
-        w: np.sqrt(np.mean((subspace.identify(u, noisy, 1.0, 6, 20, w).simulate(u) - y) ** 2))
-        for w in ("paper", "n4sid")
-    }
-    assert error["n4sid"] < 0.3 * error["paper"]
-
-
-def test_qr_replaces_cholesky_where_there_is_no_noise(data):
-    u, y, _ = data
-    c = subspace.correlate((u, y), 1.0, 6, qr=True)
-    sub = subspace.project(c, "n4sid")
-    assert subspace.choose_order(sub.singular_values) == 3
-    a, _ = subspace.shift(sub, 3)
-    assert np.allclose(np.sort(np.linalg.eigvals(a).real), np.sort(np.exp(-1 / TAU)), atol=1e-5)
 
 
 def drifting(rng, y, sigma, tau_s=2500.0):
@@ -142,37 +92,12 @@ def test_other_recordings_of_a_rig_help_where_one_is_short():
     errors = []
     for more in ((), others):
         found = identify_validated(u[:100], read[:100], 1.0, others=more)
-        x0 = found.x0 if found.info["rest"] else found.initial_state(u[:100], read[:100])
+        x0 = found.x0 if found.info["rest"] else initial_state(found, u[:100], read[:100])
         errors.append(np.sqrt(np.mean((found.simulate(u, x0)[100:] - y[100:]) ** 2)))
     assert found.info["rest"] and errors[1] < 0.7 * errors[0]
 
 
-@given(st.lists(st.floats(0.2, 1.6), min_size=1, max_size=5), st.integers(0, 1000))
-@settings(max_examples=40, deadline=None)
-def test_stabilise_leaves_the_inside_alone_and_reflects_the_rest(sizes, seed):
-    rng = np.random.default_rng(seed)
-    n = len(sizes)
-    v = rng.standard_normal((n, n)) + 3 * np.eye(n)
-    a = v @ np.diag(sizes) @ np.linalg.inv(v)
-    out = np.sort(np.linalg.eigvals(subspace.stabilise(a)).real)
-    wanted = np.sort([min(1 / s if s > 1 else s, 1 - 1e-6) for s in sizes])
-    assert np.allclose(out, wanted, rtol=1e-5, atol=1e-6)
-
-
-def test_input_matrix_and_start_by_modal_regression_equal_plain_least_squares(data):
-    u, _, noisy = data
-    u, y = u[:400], noisy[:400]
-    m = truth()
-    turn = linalg.expm(np.array([[0, 0.3, 0], [-0.3, 0, 0], [0, 0, 0.0]]))
-    a, c = turn @ m.a @ turn.T, m.c @ turn.T
-    b, x0 = subspace.input_matrix(a, c, u, y, rest=False)
-    columns = [StateSpace(a, e[:, None], c, 1.0, np.zeros(3)).simulate(u).ravel() for e in np.eye(3)]
-    columns += [StateSpace(a, m.b, c, 1.0, np.zeros(3)).simulate(0 * u, e).ravel() for e in np.eye(3)]
-    reference = np.linalg.lstsq(np.array(columns).T, y.ravel(), rcond=None)[0]
-    assert np.allclose(np.concatenate([b[:, 0], x0]), reference, rtol=1e-5, atol=1e-7)
-
-
-def test_real_poles_beat_subspace_and_are_stable(data):
+def test_real_poles_are_found_and_are_stable(data):
     u, y, noisy = data
     m = modal.identify(modal.reduce((u, noisy), 1.0), 3)
     assert m.stable and np.isreal(m.poles).all()
@@ -234,49 +159,23 @@ def test_a_noise_pole_is_refused_with_its_value():
         m.resample(0.001)
 
 
-def test_output_form_survives_a_nearly_singular_c():
-    m = truth()
-    c = np.vstack([m.c[:2], m.c[0] + 1e-9 * m.c[1]])
-    a, b = StateSpace(m.a, m.b, c, 1.0, np.zeros(3)).output_form()
-    assert np.abs(np.linalg.eigvals(a)).max() < 1.0 and np.isfinite(b).all()
-
-
 def test_prediction_error_refinement_lowers_the_prediction_error(data):
     u, _, noisy = data
     u, y = modal.reduce((u, noisy), 1.0).u[:, :, 0] / np.sqrt(10), modal.reduce((u, noisy), 1.0).y
     start = modal.identify(modal.reduce((u, y), 10.0, 10.0), 3)
-    gain = subspace.prediction_gain(start, u, y)
-    before = np.sum(subspace.innovations(start, u, y, gain) ** 2)
-    m, gain = subspace.refine_prediction_error(start, u, y, 3)
-    assert m.stable and np.sum(subspace.innovations(m, u, y, gain) ** 2) <= before
+    gain = refine.prediction_gain(start, u, y)
+    before = np.sum(refine.innovations(start, u, y, gain) ** 2)
+    m, gain = refine.by_prediction_errors(start, u, y, 4)
+    assert m.stable and np.sum(refine.innovations(m, u, y, gain) ** 2) <= before
 
 
 @pytest.mark.parametrize(
     "work, message",
     [
-        (lambda u, y: subspace.identify(u[:50], y[:50], 1.0), "needs at least"),
-        (lambda u, y: subspace.identify(u, y, 1.0, weighting="cva2"), "cva2"),
-        (
-            lambda u, y: subspace.identify(u, np.where(np.arange(len(u))[:, None] == 9, np.nan, y), 1.0),
-            "sample 9 is missing",
-        ),
         (lambda u, y: modal.reduce((u[:30], y[:30]), 1.0), "at least 20"),
         (lambda u, y: modal.identify(modal.reduce((u, 0 * y + np.nan), 1.0), 3), "has no sample"),
-        (lambda u, y: subspace.identify(0 * u, 0 * y, 1.0), "singular"),
     ],
 )
 def test_bad_data_are_refused_in_one_line(data, work, message):
     with pytest.raises(InputError, match=message):
         work(data[0], data[2])
-
-
-def test_agrees_with_slicot(data):
-    """ctrlsys (SLICOT's IB01AD, IB01BD): the same singular values and poles for W1 = W2 = I."""
-    ctrlsys = pytest.importorskip("ctrlsys")
-    u, _, noisy = data
-    out = ctrlsys.ib01ad(
-        "N", "F", "N", "O", "N", "N", 10, 1, 4, np.asfortranarray(u), np.asfortranarray(noisy), 0.0, -1.0
-    )
-    a = np.asarray(ctrlsys.ib01bd("N", "A", "N", 10, 3, 1, 4, len(u), out[1], 0.0)[0])
-    ours, _ = subspace.shift(subspace.project(subspace.correlate((u, noisy), 1.0, 10), "n4sid"), 3)
-    assert np.allclose(np.sort(np.linalg.eigvals(a).real), np.sort(np.linalg.eigvals(ours).real), atol=2e-3)

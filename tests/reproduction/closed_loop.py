@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.reproduction import paper
 from tests.reproduction.plants import HEATED, quasi_static
 from tests.reproduction.rigs import PAPER_SCALE
 from thermoctl import plant
@@ -158,10 +159,10 @@ def run(
         waiting = {k: submit(k, None) for k in ("test_2", "test_3", "test_4a")}
         rows = {k: f.result() for k, f in waiting.items()}
         say("full run: calibration tests done")
-        calibration = chain.calibrate(
+        calibration = paper.calibrate(
             of_rows(rows["test_2"]), of_rows(rows["test_3"]), of_rows(rows["test_4a"])
         )
-        models = {k: chain.compensator(calibration, k) for k in ("paper", "better")}
+        models = {k: paper.compensator(calibration, k) for k in ("paper", "better")}
         waiting = {f"test_4b_{k}": submit("test_4b", m) for k, m in models.items()}
         rows |= {k: f.result() for k, f in waiting.items()}
         say("full run: compensated tests done")
@@ -173,7 +174,7 @@ def run(
 def judge(
     truth: Path,
     rows: dict[str, np.ndarray],
-    calibration: chain.Calibration,
+    calibration: paper.Calibration,
     tests: dict[str, experiments.Schedule],
 ) -> dict[str, Any]:
     """Compute (mean, 2 s) of test 4B over all samples at rest at the target.
@@ -195,12 +196,12 @@ def judge(
     moved = rows["test_4b_better"][:, INDEX["compensation_um"]]
     quasi = {k: quasi_static_run(truth, r[k], tests[k], 1) for k in ("test_2", "test_3", "test_4a")}
     quasi["test_4b_better"] = quasi_static_run(truth, r["test_4b_better"], tests["test_4b"], 1, moved)
-    again = chain.calibrate(quasi["test_2"], quasi["test_3"], quasi["test_4a"])
+    again = paper.calibrate(quasi["test_2"], quasi["test_3"], quasi["test_4a"])
     for label, c, recording in (
         ("", calibration, r["test_4b_better"]),
         ("still_", again, quasi["test_4b_better"]),
     ):
-        estimate = chain.estimates(c, recording, starts_anew=True)
+        estimate = paper.estimates(c, recording, starts_anew=True)
         for k in ("siso", "paper", "better", "twelve"):
             error = recording.error_um - estimate[k]
             figures[f"{label}{k}_estimator"] = mean_and_two_s(

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tests.reproduction import paper
 from tests.reproduction.seeds import Kept
 from thermoctl.calibration import chain
 from thermoctl.calibration.recorded import Recorded, filled
@@ -30,7 +31,7 @@ def figures(kept: Kept) -> list[str]:
         _singular_values(c),
         _errors(
             r2,
-            {"paper's MKF": chain.estimate_mkf(c.mkf, r2), "better": chain.run_kalman(c.kalman, r2)},
+            {"paper's MKF": paper.estimate(c.mkf, r2), "better": chain.run_kalman(c.kalman, r2)},
             "Fig. 12, test 2: true rises, and the estimates' errors, means of a minute",
         ),
         _motion(r3),
@@ -80,7 +81,7 @@ def _input(r: Recorded) -> str:
     return figure(fig, f"Fig. 11, test 2: input; {share:.0f} % of its alternating power lies below f_c")
 
 
-def _singular_values(c: chain.Calibration) -> str:
+def _singular_values(c: paper.Calibration) -> str:
     fig, (a,) = _axes()
     a.semilogy(np.arange(1, 31), np.array(c.paper_model.info["singular_values"][:30]), "o-")
     a.set(xlabel="order", ylabel="singular value")
@@ -116,7 +117,7 @@ def _motion(r: Recorded) -> str:
     return figure(fig, "Fig. 13, test 3: motion, and its first quarter of an hour")
 
 
-def _gain(c: chain.Calibration, r: Recorded) -> str:
+def _gain(c: paper.Calibration, r: Recorded) -> str:
     fig, (a, b) = _axes(2)
     q = round(c.mkf.period_s)
     coil = chain.block_mean(filled(chain.rises(r)[:, :1]), q)[:, 0]

@@ -10,6 +10,7 @@ import numpy as np
 from tests.reproduction import rigs, tables
 from tests.reproduction.figures import figures
 from tests.reproduction.goals import Goal, Limit
+from tests.reproduction.paper import Calibration
 from tests.reproduction.seeds import Kept, MeanTwoS, SeedResult
 from tests.reproduction.sensors import choose_sensors
 from thermoctl.calibration import chain
@@ -177,7 +178,7 @@ def _temperatures(kept: Kept) -> Section:
     )
 
 
-def _sensors(c: chain.Calibration) -> Section:
+def _sensors(c: Calibration) -> Section:
     gains = (c.better_um.b1 + c.better_um.b2) / (1 - c.better_um.f1)
     r_v = filter.sensor_variance(chain.STEP_K, chain.NOISE_K)
     choice = choose_sensors(c.kalman.model, c.variances, r_v, gains, 12)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tests.reproduction import paper
 from tests.reproduction.rigs import CALIBRATED_S, CHAMBER, PAPER_SCALE, PROOF_DAY, ProvingRig, joined
 from thermoctl import plant
 from thermoctl.calibration import chain
@@ -41,7 +42,7 @@ class Kept:
     Its calibration, its tests, the estimates in test 3 and the residuals in test 4.
     """
 
-    calibration: chain.Calibration
+    calibration: paper.Calibration
     tests: tuple[Recorded, Recorded, Recorded, Recorded]
     estimate: dict[str, np.ndarray]  # rises in test 3
     truth: np.ndarray
@@ -67,9 +68,9 @@ def one_seed(
     run4 = joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, PROOF_DAY)
     r4a = Recorded(*(getattr(r4, f.name)[:CALIBRATION] for f in dataclasses.fields(r4)))
-    c = chain.calibrate(r2, r3, r4a)
+    c = paper.calibrate(r2, r3, r4a)
     with np.errstate(over="ignore", invalid="ignore"):
-        residual = {k: r4.true_um - v for k, v in chain.estimates(c, r4).items()}
+        residual = {k: r4.true_um - v for k, v in paper.estimates(c, r4).items()}
         residual["uncompensated"] = r4.true_um
         if disturbance is None:
             residual["bayes"] = r4.true_um - rig.bayes(run4, PROOF_DAY, r4)
@@ -95,12 +96,12 @@ def _figures(residual: np.ndarray) -> MeanTwoS:
     return mean_and_two_s(residual[CALIBRATION:]) if np.isfinite(residual).all() else (np.inf, np.inf)
 
 
-def _rises(c: chain.Calibration, r: Recorded) -> dict[str, np.ndarray]:
+def _rises(c: paper.Calibration, r: Recorded) -> dict[str, np.ndarray]:
     """Estimate the rises over a test: the paper's model alone, its MKF, the better filter."""
     q = round(c.paper_model.period_s)
     simulated = c.paper_model.simulate(chain.block_mean(r.power_w[:, None], q))
     return {
-        "open loop": chain.held(simulated, q, len(r.t)),
-        "paper": chain.estimate_mkf(c.mkf, r),
+        "open loop": paper.held(simulated, q, len(r.t)),
+        "paper": paper.estimate(c.mkf, r),
         "better": chain.run_kalman(c.kalman, r),
     }

@@ -19,7 +19,7 @@ from thermoctl.calibration.schedules import of_config
 from thermoctl.safe_file import write_text
 
 SEEN, FRESH = (*range(12), *range(1000, 1012)), tuple(range(2000, 2012))
-"""Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, chain.PAPER_CHOICES,
+"""Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, paper.CHOICES,
 chain.DRIFT_S) were chosen on the first. Every goal is checked on the others, on which nothing was chosen.
 """
 DISTURBED_SEEDS = 4

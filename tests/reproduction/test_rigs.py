@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.reproduction import closed_loop, rigs
+from tests.reproduction import closed_loop, paper, rigs
 from thermoctl import plant
 from thermoctl.calibration import chain, iso230
 from thermoctl.calibration.recorded import Recorded
 from thermoctl.identify import experiments
+from thermoctl.identify.statespace import StateSpace
 from thermoctl.report.page import page, table
 from thermoctl.yamlfile import InputError
 
@@ -79,6 +80,17 @@ def test_bad_experiments(tmp_path, text, message):
         experiments.load_experiments(path)
 
 
+def test_the_papers_model_is_exact_without_noise():
+    """A rich input and hardly any noise: N4SID with (26) finds three poles, four outputs and B."""
+    rng = np.random.default_rng(0)
+    p = np.exp(-1 / np.array([20.0, 150.0, 900.0]))
+    truth = StateSpace(np.diag(p), (1 - p)[:, None], rng.uniform(0.3, 2, (4, 3)), 1.0, np.zeros(3))
+    u = rng.standard_normal((4000, 1))
+    y = truth.simulate(u)
+    m = paper.n4sid(u, y + 1e-6 * rng.standard_normal(y.shape), 1.0, 3, 10)
+    assert np.abs(m.simulate(u) - y).max() < 0.01 * np.abs(y).max()
+
+
 @pytest.fixture(scope="module")
 def proof():
     tests = experiments.load_experiments(ROOT / "config" / "experiments.yaml")
@@ -88,12 +100,12 @@ def proof():
     run4 = rigs.joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, 4)
     r4a = Recorded(*(getattr(r4, f.name)[:7200] for f in dataclasses.fields(r4)))
-    return rig, run4, r4, chain.calibrate(r2, r3, r4a)
+    return rig, run4, r4, paper.calibrate(r2, r3, r4a)
 
 
 def test_the_better_method_beats_the_papers_and_the_coil_alone(proof):
     rig, run4, r4, c = proof
-    left = {k: iso230.mean_and_two_s((r4.true_um - v)[7200:])[1] for k, v in chain.estimates(c, r4).items()}
+    left = {k: iso230.mean_and_two_s((r4.true_um - v)[7200:])[1] for k, v in paper.estimates(c, r4).items()}
     bound = iso230.mean_and_two_s((r4.true_um - rig.bayes(run4, 4, r4))[7200:])[1]
     assert left["better"] < 0.6 * left["paper"] and left["better"] < 0.2 * left["siso"]
     assert bound < left["better"] < 6 * bound
@@ -102,7 +114,7 @@ def test_the_better_method_beats_the_papers_and_the_coil_alone(proof):
 def test_compensators_for_the_daemon_follow_the_estimators(proof):
     """The law's form at 0.1 s, stepped plainly, gives what the filter at 1 s gives."""
     _, _, r4, c = proof
-    m = chain.compensator(c, "better", period_s=0.1)
+    m = chain.compensator(c.kalman, c.better_um, period_s=0.1)
     n = 1800
     x = np.zeros(len(m.A_minus_I))
     rate, coil = chain.air_rate(r4.air_c), chain.rises(r4)[:, 0]
@@ -115,7 +127,7 @@ def test_compensators_for_the_daemon_follow_the_estimators(proof):
             x = x + m.A_minus_I @ x + m.B @ [r4.power_w[k], rate[k]]
     wanted = chain.run_kalman(c.kalman, r4)[:n]
     assert np.sqrt(np.mean((out - wanted) ** 2)) < 0.15
-    assert chain.compensator(c, "paper").kind == "mkf"
+    assert paper.compensator(c, "paper").kind == "mkf"
 
 
 def test_the_full_runs_truth_is_found_from_any_folder(tmp_path, monkeypatch):

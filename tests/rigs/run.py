@@ -63,10 +63,8 @@ def recorded(settings: Settings, rows: np.ndarray) -> Recorded:
 def calibrated(settings: Settings, order: int = 0) -> CompensatorModel:
     """Return the model from three tests."""
     tests = [recorded(settings, record(settings, seed)) for seed in (1, 2, 3)]
-    _, kalman, _, expansion = chain.calibrate_better(tests, order or None)
-    return chain.better_compensator(
-        kalman, expansion, settings.loop.period_s, points=settings.channels.point_names
-    )
+    _, kalman, _, expansion = chain.calibrate(tests, order or None)
+    return chain.compensator(kalman, expansion, settings.loop.period_s, points=settings.channels.point_names)
 
 
 def errors(settings: Settings, model: CompensatorModel | None) -> float:

@@ -73,35 +73,25 @@ def record(experiment_file: Path, recording: Path, config: str, plant: str | Non
         )
 
 
-def identify(
-    test_2: str, test_3: str, test_4a: str, config: str, models: str | None, method: str, order: int
-) -> int:
+def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str | None, order: int) -> int:
     """Run `thermoctl identify`.
 
     Calibrate from recordings and install the compensator in the folder `models`."""
     settings = load_settings(config)
-    r2, r3, r4 = (recorded.read(p, settings.channels.point_names) for p in (test_2, test_3, test_4a))
-    figures: dict[str, Any] = {"method": method}
-    if method == "paper":
-        c = chain.calibrate(r2, r3, r4, order or None)
-        model = chain.compensator(c, method, settings.loop.period_s, points=settings.channels.point_names)
-        left = r4.error_um - chain.estimates(c, r4)[method]
-        figures |= {"time_constants_s": c.paper_model.time_constants_s, "zeta": c.mkf.zeta}
-    else:
-        thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
-        model = chain.better_compensator(
-            kalman, um, settings.loop.period_s, points=settings.channels.point_names
-        )
-        left = r4.error_um - um.predict(
-            chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info.get("start_um", 0.0)
-        )
-        figures |= {
-            "time_constants_s": thermal.info["time_constants_s"],
-            "residual_rms_k": thermal.info["residual_rms"],
-            "variances": variances,
-            "refinement": refined,
-        }
-        print(f"prediction-error refinement: {refined}")
+    points = settings.channels.point_names
+    r2, r3, r4 = (recorded.read(p, points) for p in (test_2, test_3, test_4a))
+    thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
+    print(f"prediction-error refinement: {refined}")
+    model = chain.compensator(kalman, um, settings.loop.period_s, points=points)
+    left = r4.error_um - um.predict(
+        chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info["start_um"]
+    )
+    figures: dict[str, Any] = {
+        "time_constants_s": thermal.info["time_constants_s"],
+        "residual_rms_k": thermal.info["residual_rms"],
+        "variances": variances,
+        "refinement": refined,
+    }
     figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
     folder = _models(models, settings)
     path = modelfile.install(folder, model, settings.rig.name, [test_2, test_3, test_4a], figures)

@@ -183,8 +183,8 @@ def model(settings: Settings, recordings: Mapping[str, Path], order: int, path: 
     """Fit the model to the recordings of FITTED and save it at `path`."""
     points = settings.channels.point_names
     tests = [read(recordings[n], points) for n in FITTED]
-    thermal, kalman, _, expansion = chain.calibrate_better(tests, order or None)
-    compensator = chain.better_compensator(kalman, expansion, settings.loop.period_s, points=points)
+    thermal, kalman, _, expansion = chain.calibrate(tests, order or None)
+    compensator = chain.compensator(kalman, expansion, settings.loop.period_s, points=points)
     last = tests[-1]
     residual = last.error_um - _estimate(kalman, expansion, last)
     thin = max(1, len(residual) // SHOWN)
@@ -223,7 +223,7 @@ def proof(settings: Settings, recordings: Mapping[str, Path], order: int, acting
     else:
         points = settings.channels.point_names
         tests = [read(recordings[n], points) for n in FITTED]
-        _, kalman, _, expansion = chain.calibrate_better(tests, order or None)
+        _, kalman, _, expansion = chain.calibrate(tests, order or None)
         r = read(recordings["test_4b"], points)
         left = growth - np.interp(t.t - t.t[0], r.t, _estimate(kalman, expansion, r))
         how = (

@@ -2,8 +2,8 @@
 
     yL(n+1) = f1 yL(n) + sum_m [b_m,1 T_m(n-1) + b_m,2 T_m(n)]                               (2), (3), (39)
 
-Equation error (the paper's method): block least squares, or recursion (5), with the *measured* yL in the
-regressor. Noise on yL biases f1 towards 0: with 0.05 um of noise a time constant of 180 s was found as 3.2 s.
+Equation error (the paper's (5)) has the *measured* yL in the regressor. Noise on yL biases f1 towards 0: with
+0.05 um of noise a time constant of 180 s was found as 3.2 s.
 
 Output error: the regressor holds the model's own past output. For a given f1 the model is linear in b, with
 inputs filtered by 1/(z - f1) and the decay f1^n of the first output. So one number f1 is searched, with a
@@ -54,37 +54,6 @@ class Expansion:
             drive[1:] += self.b_air * (air[:-1] - air[0])
         drive[0] = start_um
         return signal.lfilter([1.0], [1.0, -self.f1], drive) + self.offset_um
-
-
-def regressors(rises: np.ndarray) -> np.ndarray:
-    """Rows [T(n-1), T(n)] (N, 2M) of (3); the first row repeats T(0)."""
-    return np.hstack([np.vstack([rises[:1], rises[:-1]]), rises])
-
-
-def recursive(
-    rises: np.ndarray,
-    y: np.ndarray,
-    period_s: float,
-    weight: float = 1.0,
-    q0: float = 1e6,
-    own_output: bool = False,
-) -> Expansion:
-    """Fit by the paper's recursion (5) with weight lambda and Q(0) = q0 I.
-
-    `own_output` puts the model's own past output in the regressor as (3) is written, else the measured one.
-    Only the latter equals the block solution.
-    """
-    _check(rises, y)
-    phi = np.ascontiguousarray(regressors(rises)[:-1])
-    p = phi.shape[1] + 1
-    theta, q = np.zeros(p), q0 * np.eye(p)
-    if own_output:
-        kernels.rls_own_output(theta, q, phi, np.ascontiguousarray(y[1:]), weight, float(y[0]))
-    else:
-        kernels.rls_run(theta, q, np.hstack([phi, y[:-1, None]]), np.ascontiguousarray(y[1:]), weight)
-    return _from_theta(
-        theta, period_s, {"method": "recursion (5)", "weight": weight, "own_output": own_output}
-    )
 
 
 def output_error(
@@ -208,7 +177,6 @@ class Bank:
             self.cost,
             self.state,
             self.poles,
-            np.zeros(1),
             rises,
             np.ascontiguousarray(y, dtype=float),
             self.weight,
@@ -276,11 +244,6 @@ class Bank:
         f, p = self.poles[k], self.r.shape[1]
         ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
         return np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
-
-
-def _from_theta(theta: np.ndarray, period_s: float, info: dict[str, Any]) -> Expansion:
-    m = (len(theta) - 1) // 2
-    return Expansion(float(theta[-1]), theta[:m], theta[m : 2 * m], period_s, 0.0, 0.0, info)
 
 
 def _check(rises: np.ndarray, y: np.ndarray) -> None:

@@ -1,13 +1,4 @@
-"""Temperature estimators: the paper's modified Kalman filter, and a steady Kalman filter.
-
-Modified Kalman filter (MKF): output as state (33), scalar gain of the coil's row (34), (35), mapped to the
-other points by zeta:
-
-    zeta = [1, sigma_2/sigma_1 ...], sigma_j = cov(e_1, e_j), e: error in the identification test   (36), (37)
-    R_v = (quantisation step)^2/12 + noise^2 of the thermocouple
-    R_w = (rms error of the coil in the identification test)^2 + R_v, as in the paper (its 0.46 degC)
-
-Kalman filter:
+"""A steady Kalman filter that estimates the temperatures of all points from the coil.
 
     x(n+1) = A x + B [power, d(air)/dt] + w, y = C x + v, rises above the air
 
@@ -38,61 +29,6 @@ from thermoctl.yamlfile import InputError
 def sensor_variance(step_k: float, noise_k: float) -> float:
     """R_v, K^2: quantisation step^2/12 and the sensor's own noise."""
     return step_k**2 / 12 + noise_k**2
-
-
-@dataclass(frozen=True)
-class Mkf:
-    """alpha (M, M), beta (M, 1), zeta (M,), R_w and R_v K^2.
-
-    sigma_1 K^2 (the coil's error variance) for the table."""
-
-    alpha: np.ndarray
-    beta: np.ndarray
-    zeta: np.ndarray
-    r_w: float
-    r_v: float
-    period_s: float
-    sigma_1: float
-
-    def run(
-        self, power_w: np.ndarray, coil_k: np.ndarray, start_k: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return filtered rises (N, M) and gains (N,) for power (N,) and coil rises (N,).
-
-        NaN in the coil's rises: no reading came."""
-        start = np.zeros(len(self.alpha)) if start_k is None else start_k
-        return kernels.mkf_run(
-            _c(self.alpha),
-            _c(self.beta),
-            _c(self.zeta),
-            self.r_w,
-            self.r_v,
-            _c(start),
-            _c(power_w[:, None]),
-            _c(coil_k),
-        )
-
-
-def mkf(model: StateSpace, u: np.ndarray, y: np.ndarray, r_v: float, period_s: float) -> Mkf:
-    """Identify the paper's filter from a test; the filter returned runs with the period `period_s`.
-
-    u (N, 1) W and y (N, M) K have the sampling period of `model`."""
-    e = y - model.simulate(u, model.x0)
-    e = e[np.isfinite(e).all(1)]
-    centred = e - e.mean(0)
-    sigma = centred[:, :1].T @ centred / len(e)
-    r_w = float((e[:, 0] ** 2).mean() + r_v)
-    alpha, beta = model.resample(period_s).output_form()
-    # The residual's variance grows over one period of `model`: scale it to the filter's shorter period.
-    return Mkf(
-        alpha,
-        beta[:, :1],
-        sigma[0] / sigma[0, 0],
-        r_w * period_s / max(model.period_s, period_s),
-        r_v,
-        period_s,
-        float(sigma[0, 0]),
-    )
 
 
 def with_air(model: StateSpace) -> StateSpace:

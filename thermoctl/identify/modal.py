@@ -36,9 +36,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, signal
+from scipy import linalg, optimize, signal
 
-from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, modal
 from thermoctl.yamlfile import InputError
 
@@ -82,35 +81,30 @@ def reduce(
     basis = gram_polynomials(q)
     if isinstance(chunks, tuple):
         chunks = [chunks]
-    u = y = count = np.zeros(0)
-    start = 0
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # moments, sums and counts of the outputs
+    samples, left = 0, None
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
         for k in range(0, len(cu), 100_000):  # small pieces: bounded memory whatever the caller's chunks are
-            z = np.ascontiguousarray(np.hstack([cu[k : k + 100_000], cy[k : k + 100_000]]), dtype=float)
-            if not u.size:
-                u, y = np.zeros((64, cu.shape[1], len(basis))), np.zeros((64, cy.shape[1]))
-                count = np.zeros_like(y)
-            m = cu.shape[1]
-            if not np.isfinite(z[:, :m]).all():
-                row = start + int(np.flatnonzero(~np.isfinite(z[:, :m]).all(1))[0])
+            u, y = cu[k : k + 100_000], cy[k : k + 100_000]
+            if not np.isfinite(u).all():
+                row = samples + int(np.flatnonzero(~np.isfinite(u).all(1))[0])
                 raise InputError(
                     f"an input is missing at sample {row}; identification needs every sample of the inputs"
                 )
-            need = (start + len(z)) // q + 1
-            if need > len(u):
-                grow = max(need, 2 * len(u)) - len(u)
-                u, y, count = (np.concatenate([v, np.zeros((grow, *v.shape[1:]))]) for v in (u, y, count))
-            kernels.block_moments(z, m, basis, u, y, count, start)
-            start += len(z)
-    blocks = start // q
-    if blocks < 20:
+            samples += len(u)
+            z = np.hstack([u, y]) if left is None else np.vstack([left, np.hstack([u, y])])
+            whole = z[: len(z) // q * q].reshape(-1, q, z.shape[1])
+            left, m = z[len(z) // q * q :], u.shape[1]
+            moments = np.einsum("jqm,rq->jmr", whole[..., :m], basis)
+            parts.append((moments, np.nansum(whole[..., m:], 1), np.isfinite(whole[..., m:]).sum(1)))
+    if samples < 20 * q:
         raise InputError(
-            f"{start} samples of {period_s:g} s are {blocks} blocks of {q * period_s:g} s; at least 20 are needed"
+            f"{samples} samples of {period_s:g} s are {samples // q} blocks of {q * period_s:g} s; at least 20 are needed"
         )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        means = y[:blocks] / count[:blocks]
-    return Blocks(u[:blocks], means, count[:blocks] / q, q, period_s, basis)
+    moments, sums, count = (np.concatenate(v) for v in zip(*parts, strict=True))
+    with np.errstate(invalid="ignore"):
+        return Blocks(moments, sums / count, count / q, q, period_s, basis)
 
 
 def _responses(
@@ -156,16 +150,14 @@ def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, 
         # the block's input as moments: its effect on the block's end state and on the block's mean
         end, dend = blocks.u @ (basis @ powers), blocks.u @ (basis @ dpowers)  # (J, m)
         mean, dmean = blocks.u @ (basis @ held) / q, blocks.u @ (basis @ dheld) / q
-        for m in range(end.shape[1]):
-            s, ds = kernels.decays(pq[k : k + 1], np.ascontiguousarray(end[:, m])[None])
-            t, _ = kernels.decays(pq[k : k + 1], np.ascontiguousarray(dend[:, m])[None])
-            s, ds = s[0], ds[0] * dpq[k] + t[0]
-            # scaled by (1 - p), so that every column has the size of the input for any time constant
-            f = first * s + mean[:, m]
-            df = dfirst * s + first * ds + dmean[:, m]
-            F.append((1 - p[k]) * f)
-            D.append((1 - p[k]) * df - dp[k] * f)
-            owner.append(k)
+        states = signal.lfilter([0, 1], [1, -pq[k]], end, axis=0)  # s(j+1) = p^q s(j) + end(j)
+        dstates = signal.lfilter([0, 1], [1, -pq[k]], states * dpq[k] + dend, axis=0)
+        # scaled by (1 - p), so that every column has the size of the input for any time constant
+        f = first * states + mean
+        df = dfirst * states + first * dstates + dmean
+        F += list(((1 - p[k]) * f).T)
+        D += list(((1 - p[k]) * df - dp[k] * f).T)
+        owner += end.shape[1] * [k]
         if not rest:
             n = np.arange(J)
             decay = pq[k] ** n
@@ -207,47 +199,37 @@ def _fit(
     ridge: float = 1e-7,
     drift_s: tuple[float, float] | None = None,
 ) -> _Fit:
-    """Fit ln tau by Levenberg-Marquardt. `Y` (J, l) is scaled by noise, `weight` (J,) is by row."""
-    x = np.log(tau)
+    """Fit ln tau within its bounds. `Y` (J, l) is scaled by noise, `weight` (J,) is by row."""
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]
-    lo, hi = np.log(bounds[0]), np.log(bounds[1])
+    latest: dict[bytes, tuple[np.ndarray, ...]] = {}
 
-    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the weighted sum of squares at x = ln tau, then Q, residues, residual, D and owner.
+    def parts(x: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return Q, residues, residual (J, l), D and owner at x = ln tau; the last point is kept.
 
         D: derivatives of the responses by ln tau; owner: the time constant of each column."""
-        F, D, owner = _responses(blocks, np.exp(x), rest)
-        F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
-        Q, theta, r = _project(F, Y, ridge)
-        return float((r**2).sum()), Q, theta, r, D, owner
+        if x.tobytes() not in latest:
+            F, D, owner = _responses(blocks, np.exp(x), rest)
+            F, D = (_whitened(v, blocks, drift_s) * weight[:, None] for v in (F, D))
+            latest.clear()
+            latest[x.tobytes()] = (*_project(F, Y, ridge), D, owner)
+        return latest[x.tobytes()]
 
-    cost, Q, theta, r, D, owner = evaluate(x)
-    damping, done = 1e-3, 0
-    for done in range(1, iterations + 1):  # noqa: B007
-        PD = D - Q @ (Q.T @ D)
-        H = (PD.T @ PD) * (theta @ theta.T)
-        g = -((PD.T @ r) * theta).sum(1)
-        E = np.zeros((len(owner), len(x)))
-        E[np.arange(len(owner)), owner] = 1
-        H, g = E.T @ H @ E, E.T @ g
-        better = False
-        for _ in range(8):
-            step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12 * np.trace(H) + 1e-300), -g)
-            trial = np.sort(np.clip(x + np.clip(step, -1, 1), lo, hi))
-            new = evaluate(trial)
-            if new[0] < cost:
-                better = True
-                break
-            damping *= 10
-        if not better:
-            break
-        gain = (cost - new[0]) / cost
-        x = trial
-        cost, Q, theta, r, D, owner = new
-        damping = max(damping / 10, 1e-9)
-        if gain < 1e-7:
-            break
-    return _Fit(np.exp(x), theta, cost, done)
+    def slopes(x: np.ndarray) -> np.ndarray:
+        """Return the derivatives (J l, K) of the residual by Kaufman's simplification."""
+        Q, theta, _, D, owner = parts(x)
+        off = D - Q @ (Q.T @ D)
+        return np.stack([-(off[:, owner == k] @ theta[owner == k]).ravel() for k in range(len(x))], axis=1)
+
+    found = optimize.least_squares(
+        lambda x: parts(x)[2].ravel(),
+        np.log(tau),
+        slopes,
+        bounds=tuple(np.log(bounds)),
+        ftol=1e-7,
+        max_nfev=iterations,
+    )
+    x = np.sort(found.x)
+    return _Fit(np.exp(x), parts(x)[1], 2 * found.cost, found.nfev)
 
 
 def identify(

@@ -1,7 +1,6 @@
-"""A linear thermal model: output form, resampling, simulation.
+"""A linear thermal model: resampling, simulation.
 
     x(n+1) = A x(n) + B u(n),   y(n) = C x(n)                                     (31), (32) with D = 0
-    output form: y(n+1) = alpha y(n) + beta u(n), alpha = C A C+, beta = C B      (33)
 
 Resampling: [[A, B], [0, I]] at one period T is the exponential of [[F, G], [0, 0]] T. Its logarithm gives any
 other period.
@@ -58,29 +57,6 @@ class StateSpace:
         """Free run: outputs (N, l) for inputs u (N, m), from x0 (default: rest)."""
         x0 = np.zeros(self.order) if x0 is None else x0
         return kernels.simulate(_c(self.a), _c(self.b), _c(self.c), _c(x0), _c(np.atleast_2d(u.T).T))
-
-    def initial_state(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the least-squares x0 (n,) of a free run over u (N, m) for y (N, l); NaN in y is left out."""
-        free = self.simulate(u)
-        columns = np.stack(
-            [
-                kernels.simulate(
-                    _c(self.a), _c(np.zeros_like(self.b)), _c(self.c), e, _c(np.atleast_2d(u.T).T)
-                )
-                for e in np.eye(self.order)
-            ],
-            axis=-1,
-        )
-        here = np.isfinite(y)
-        # slow states are nearly collinear over a short record: a ridge keeps them small
-        return _ridge(columns[here], (y - free)[here][:, None], 1e-5)[:, 0]
-
-    def output_form(self, tolerance: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-        """Return alpha (l, l), beta (l, m) of (33).
-
-        The inverse of C omits singular values below `tolerance` of the largest. Order 12 always has noise
-        modes: cond(C) reached 3e5, and the plain inverse amplifies them."""
-        return self.c @ self.a @ np.linalg.pinv(self.c, rcond=tolerance), self.c @ self.b
 
     def resample(self, period_s: float) -> StateSpace:
         """Return the same continuous system, inputs held, at another period.
@@ -148,11 +124,3 @@ def modal(
 
 def _c(v: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(v, dtype=float)
-
-
-def _ridge(f: np.ndarray, y: np.ndarray, relative: float = 1e-12) -> np.ndarray:
-    """Solve least squares by the normal equations, with a ridge `relative` to each column's size."""
-    g = f.T @ f
-    d = np.sqrt(np.maximum(np.diag(g), 1e-300))
-    g = g / d / d[:, None] + relative * np.eye(len(g))
-    return linalg.solve(g, (f.T @ y) / d[:, None], assume_a="pos") / d[:, None]
