@@ -1,1 +1,1 @@
-"""Plants for other programs: C, FMU, Python, Modelica."""
+"""Plants for other programs: C, FMU, Python."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 import numpy as np
 
 from thermoctl.export.c import c_source
 from thermoctl.export.fmu import write_fmu
-from thermoctl.export.modelica import modelica_source
 from thermoctl.export.python import python_source
 from thermoctl.export.values import values
 from thermoctl.plant import Plant, load
@@ -21,7 +19,7 @@ from thermoctl.recording.table import Table
 from thermoctl.safe_file import write_text
 from thermoctl.yamlfile import InputError
 
-SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c"}
+SUFFIX = {"fmu": ".fmu", "python": ".py", "c": ".c"}
 
 
 def export(args: argparse.Namespace) -> int:
@@ -48,8 +46,6 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             f"{plant.file}: a plant that calls an FMU cannot be exported; write the effect into the FMU's own model"
         )
     numbers = values(plant, equations, recording)
-    name = re.sub(r"\W", "_", out.stem)
-    name = name if name[:1].isalpha() else f"plant_{name}"
     if to == "fmu":
         start = {}
         for i in plant.inputs.values() if recording else ():
@@ -58,9 +54,4 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             start[i.name] = float(column[np.isfinite(column)][0])
         write_fmu(plant, numbers, out, start)
         return
-    text = {
-        "modelica": lambda: modelica_source(plant, numbers, name),
-        "python": lambda: python_source(plant, numbers),
-        "c": lambda: c_source(plant, numbers),
-    }[to]()
-    write_text(out, text)
+    write_text(out, (python_source if to == "python" else c_source)(plant, numbers))
