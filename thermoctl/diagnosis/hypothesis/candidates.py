@@ -61,21 +61,6 @@ class Candidate(Placement):
             out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
         return out
 
-    def surprise(self, plant: Plant) -> float:
-        """Return -2 log prior of the effect's values in `plant`, over all recordings."""
-        total = 0.0
-        for b in self.beliefs(plant):
-            total += float(
-                ex.evaluate(
-                    b.neg2_log,
-                    {
-                        n: plant.parameters[n].values.get(b.recording, plant.parameters[n].value)
-                        for n in ex.names(b.neg2_log)
-                    },
-                )
-            )
-        return total
-
     def extend(
         self, values: Mapping[str, Any], ranges: Mapping[str, tuple[float, float]] | None = None
     ) -> Plant:
