@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.profile import Cia402, Object
-from thermoctl_hal.can.cia402 import Objects
 from thermoctl_hal.can.dbc_file import load_dbc
 from thermoctl_hal.can.eds import read_eds
+from thermoctl_hal.can.set_up import Objects
 
 STATUS_WORD, CONTROL_WORD = Object(0x6041), Object(0x6040)
 

@@ -115,9 +115,9 @@ def _cut(data: bytes) -> list[bytes]:
 
 def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """Encoder frames and text lines in any pieces; what the framer keeps stays small."""
+    from thermoctl_hal.base.line import LineReader
     from thermoctl_hal.base.profile import BinaryFrame
     from thermoctl_hal.base.wire import Framer
-    from thermoctl_hal.serial.line import LineReader
 
     fields = (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8"))
     specs = [
@@ -148,8 +148,8 @@ def serial() -> tuple[Callable[[bytes], Any], list[bytes]]:
 
 def slcan() -> tuple[Callable[[bytes], Any], list[bytes]]:
     """An adapter's answers, and a drive's frames behind them."""
+    from thermoctl_hal.base.cia402 import drive_state, next_control_word
     from thermoctl_hal.base.wire import SlcanParser, encode_slcan
-    from thermoctl_hal.can.drive import drive_state, next_control_word
 
     def one(data: bytes) -> None:
         parser = SlcanParser()

@@ -15,9 +15,9 @@ from thermoctl_hal.base.backend import (
     HardwareError,
     Sample,
 )
+from thermoctl_hal.base.cia402 import drive_state, next_control_word
 from thermoctl_hal.base.wire import EXTENDED, SlcanParser, encode_slcan
 from thermoctl_hal.can.bus import open_can
-from thermoctl_hal.can.drive import drive_state, next_control_word
 from thermoctl_hal.virtual.drive import (
     DISABLED,
     ENABLED,

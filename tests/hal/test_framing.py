@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermoctl_hal.base.latency_timer import latency_timer_ms, set_latency_timer
+from thermoctl_hal.base.line import MAX_LINE, LineReader
 from thermoctl_hal.base.profile import BinaryFrame
 from thermoctl_hal.base.wire import Framer, checksum
-from thermoctl_hal.serial.latency_timer import latency_timer_ms, set_latency_timer
-from thermoctl_hal.serial.line import MAX_LINE, LineReader
 
 SPEC = BinaryFrame(
     b"\xaa\x55", (("sequence", "uint16"), ("counts", "int32"), ("status", "uint8")), sequence="sequence"

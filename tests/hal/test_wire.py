@@ -298,8 +298,8 @@ def test_a_port_that_goes_while_it_is_opened_is_a_hardware_error(monkeypatch):
     """termios.error is no OSError: it would end the thread that connects a device again."""
     import termios
 
+    from thermoctl_hal.base.line import open_port
     from thermoctl_hal.base.profile import LineSettings
-    from thermoctl_hal.serial.line import open_port
 
     master, slave = os.openpty()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from thermoctl.safe_file import whole_file
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.key import REQUIRED, Key
-from thermoctl_hal.buses import BUSES
+from thermoctl_hal.profiles.buses import BUSES
 from thermoctl_hal.profiles.keys import TABLES
 from thermoctl_hal.profiles.read import FORMAT, load_profile
 

@@ -5,7 +5,8 @@ binding (thermoctl_hal.base.binding) says where the device is on this rig. Every
 
     reading = raw * scale + offset      in `unit`; outside `range`: error; older than `stale_after_s`: stale
 
-and the place of its raw number on the bus. buses.py lists the buses; profiles/read.py reads the files.
+and the place of its raw number on the bus. profiles/buses.py lists the
+buses; profiles/read.py reads the files.
 """
 
 from __future__ import annotations

@@ -31,9 +31,9 @@ from collections import deque
 from typing import Any
 
 from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.line import open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import EXTENDED, CanPort, SlcanLine
-from thermoctl_hal.serial.line import open_port
 
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
 READ_S = 0.1  # between looks of a reading thread at its end

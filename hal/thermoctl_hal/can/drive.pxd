@@ -1,14 +1,11 @@
 # C types for drive.py, which runs in every tick; see there.
 cimport cython
+from thermoctl_hal.base.cia402 cimport drive_state, next_control_word
 from thermoctl_hal.base.device cimport Device
 from thermoctl_hal.base.wire cimport CanPort, nearest
 
 cdef int _SYNC_ID, _PRE_OPERATIONAL
-cdef double _OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP, _RESET_S
-
-cpdef double drive_state(int status_word) noexcept
-@cython.locals(state=cython.int)
-cpdef int next_control_word(int status_word, bint enable) noexcept
+cdef double _OFFLINE, _ENABLED, _FAULT, _RESET_S
 
 cdef class Cia402Device(Device):
     cdef public object _spec, _formats

@@ -4,21 +4,12 @@
 RPDO 1 = control word | command, then SYNC. TPDO 1 answers the SYNC with status word | readings; it is read
 one tick later. Heartbeats go both ways: the drive stops by itself when ours is missing for `watchdog_s`, and
 its channels are ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, NMT start):
-thermoctl_hal.can.cia402.
+thermoctl_hal.can.set_up. States and control words: thermoctl_hal.base.cia402.
 
-    status word & mask = value -> state          control word for the next step towards 'operation enabled'
-      0x4F  0x00  not ready to switch on         -                        (the drive goes on by itself)
-      0x4F  0x40  switch on disabled             0x06 shutdown
-      0x6F  0x21  ready to switch on             0x07 switch on
-      0x6F  0x23  switched on                    0x0F enable operation
-      0x6F  0x27  operation enabled              0x0F
-      0x6F  0x07  quick stop active              0x00 disable voltage
-      0x4F  0x0F  fault reaction active          -
-      0x4F  0x08  fault                          0x80 fault reset (rising edge), only while `enable` is False
-
-Only a new `enable` takes these steps. A drive that leaves 'operation enabled' without our command (quick stop
-from an input, supply, its own fault) is disabled. It stays disabled until `enable` was withdrawn and is given
-again. Until then its state reads as the state it left to, so that a stop between two ticks is seen, too.
+Only a new `enable` takes the steps towards 'operation enabled'. A drive that leaves it without our command
+(quick stop from an input, supply, its own fault) is disabled. It stays disabled until `enable` was withdrawn
+and is given again. Until then its state reads as the state it left to, so that a stop between two ticks is
+seen, too.
 """
 
 from __future__ import annotations
@@ -30,21 +21,14 @@ import time
 from array import array
 
 from thermoctl.yamlfile import InputError
-from thermoctl_hal.base.backend import (
-    AMP_DISABLED,
-    AMP_ENABLED,
-    AMP_FAULT,
-    AMP_OFFLINE,
-    AMP_QUICK_STOP,
-    HardwareError,
-    Sample,
-)
+from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.cia402 import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word, state_name
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ACTUAL_POSITION, POSITION_MODES, STATUS_WORD, Cia402, Object, typed
 from thermoctl_hal.base.wire import nearest
 from thermoctl_hal.can.bus import AnyPort, open_can
-from thermoctl_hal.can.cia402 import (
+from thermoctl_hal.can.set_up import (
     NMT_ID,
     NMT_RESET_COMMUNICATION,
     NMT_START,
@@ -57,56 +41,9 @@ from thermoctl_hal.can.cia402 import (
     switch_off,
 )
 
-MAX_STEP_S = 0.01  # longest time for which a position target moves in one write
-FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while `enable` is False
 _PRE_OPERATIONAL = 0x7F  # NMT state in a heartbeat; 0: the node has just booted
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
-_OFFLINE, _DISABLED, _ENABLED, _FAULT, _QUICK_STOP = (
-    AMP_OFFLINE,
-    AMP_DISABLED,
-    AMP_ENABLED,
-    AMP_FAULT,
-    AMP_QUICK_STOP,
-)  # numbers of C, by drive.pxd
-_STATES = (
-    (0x4F, 0x00, "not ready to switch on"),
-    (0x4F, 0x40, "switched off (switch on disabled)"),
-    (0x6F, 0x21, "switched off (ready to switch on)"),
-    (0x6F, 0x23, "switched on, operation disabled"),
-    (0x6F, 0x27, "operation enabled"),
-    (0x6F, 0x07, "quick stop active"),
-    (0x4F, 0x0F, "fault reaction active"),
-    (0x4F, 0x08, "fault"),
-    (0, 0, "a state that CiA 402 does not know"),
-)
-
-
-def drive_state(status_word: int) -> float:
-    """Return the amplifier_state (AMP_*, thermoctl_hal.base.backend) of a CiA-402 status word."""
-    if status_word & 0x4F in (0x0F, 0x08):
-        return _FAULT
-    if status_word & 0x6F == 0x27:
-        return _ENABLED
-    if status_word & 0x6F == 0x07:
-        return _QUICK_STOP
-    return _OFFLINE if status_word & 0x4F == 0x00 else _DISABLED
-
-
-def state_name(status_word: int) -> str:
-    """Return the CiA-402 state of a status word in the standard's words."""
-    return next(name for mask, value, name in _STATES if status_word & mask == value)
-
-
-def next_control_word(status_word: int, enable: bool) -> int:
-    """Return the control word for one step towards the wanted state (table in the module's text)."""
-    state = status_word & 0x6F
-    if not enable:
-        return 0x06 if state in (0x23, 0x27) else 0x00
-    if status_word & 0x4F == 0x40:
-        return 0x06
-    if state == 0x21:
-        return 0x07
-    return 0x0F if state in (0x23, 0x27) else 0x00
+_OFFLINE, _ENABLED, _FAULT = AMP_OFFLINE, AMP_ENABLED, AMP_FAULT  # numbers of C, by drive.pxd
 
 
 class Cia402Device(Device):

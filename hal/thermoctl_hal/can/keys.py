@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from thermoctl_hal.base.cia402 import START_UP
 from thermoctl_hal.base.key import REQUIRED, Key
 
 CAN: dict[str, tuple[Key, ...]] = {
@@ -77,11 +78,7 @@ CAN: dict[str, tuple[Key, ...]] = {
         Key("master_id", "integer", "our own node id (missing: 127 - node id)", 0, "", 1, 127),
         Key("sdo_timeout_s", "number", "longest time for an answer at set-up", 0.3, "s", 0.01, 10),
     ),
-    "start_up": (
-        Key("index", "integer", "index of the object", REQUIRED, "", 0x1000, 0xFFFF, example="0x6075"),
-        Key("sub", "integer", "sub-index", 0, "", 0, 255),
-        Key("value", "integer", "the number written", REQUIRED, "", -(2**31), 2**32, example="2500"),
-    ),
+    "start_up": START_UP,
     "channel of can-cia402": (Key("object", "node", "an object of `transmit`, or 0x603F (error code)"),),
     "message of can-dbc": (
         Key("message", "text", "message of the DBC file"),

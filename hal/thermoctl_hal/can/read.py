@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermoctl.yamlfile import Node, Section, integer_of, kind_of, number_of
+from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl_hal.base.cia402 import OBJECT_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import named, sentinel_of, take
 from thermoctl_hal.base.profile import (
     ERROR_CODE,
-    FIELD_TYPES,
     STATUS_WORD,
     BusSpec,
     Cia402,
@@ -27,9 +26,7 @@ from thermoctl_hal.can.keys import CAN
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Signal
 
-MAX_SUB_INDEX = 255
 NEAR_RAW = 0.01  # a value is that of a raw number when it lies so close to it, in steps
-OBJECT_TYPES = {t: c for t, c in FIELD_TYPES.items() if t[-2:] != "64" and not t.startswith("float")}
 
 
 def read_dbc(top: Section, folder: Path) -> Dbc:
@@ -117,7 +114,7 @@ def read_cia402(top: Section, folder: Path) -> Cia402:
     start_up = []
     for node in k["start_up"] or ():
         w = Section(node, "start_up")
-        v = take(w, CAN["start_up"])
+        v = take(w, START_UP)
         start_up.append((v["index"], v["sub"], v["value"]))
         w.end()
     objects = {}
@@ -145,20 +142,6 @@ def read_cia402(top: Section, folder: Path) -> Cia402:
         )
     s.end()
     return spec
-
-
-def read_object_name(node: Node, key: str) -> Object:
-    """Return an object: 0x6041, or 0x30D1:1 with the sub-index (decimal, or 0x.. in hexadecimal)."""
-    if isinstance(node.value, int) and not isinstance(node.value, bool):
-        return Object(integer_of(node, key, 0x1000, 0xFFFF))
-    found = re.fullmatch(r"(0x[1-9A-Fa-f][0-9A-Fa-f]{3})(?::(0x[0-9A-Fa-f]{1,2}|\d{1,3}))?", str(node.value))
-    sub = found[2] or "0" if found else "0"
-    item = Object(int(found[1] if found else "0", 16), int(sub, 16 if "x" in sub else 10))
-    if found is None or item.sub > MAX_SUB_INDEX:
-        raise node.error(
-            f"{key}: an object as 0x6041, or 0x30D1:1 with its sub-index, was expected, found {kind_of(node)}"
-        )
-    return item
 
 
 def read_object(s: Section, spec: BusSpec) -> Object:

@@ -20,9 +20,9 @@ from thermoctl.extras import load
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.cia402 import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ACTUAL_POSITION, POSITION_MODES, Amplifier, typed
-from thermoctl_hal.can.drive import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word
 from thermoctl_hal.ethercat.bus import EthercatBus, bus_of
 from thermoctl_hal.ethercat.read import Ethercat, Place
 from thermoctl_hal.ethercat.slave import SlaveSetUp

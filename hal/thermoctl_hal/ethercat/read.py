@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl_hal.base.cia402 import OBJECT_TYPES, STANDARD_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     FIELD_TYPES,
@@ -19,9 +20,6 @@ from thermoctl_hal.base.profile import (
     object_name,
     typed,
 )
-from thermoctl_hal.can.cia402 import STANDARD_TYPES
-from thermoctl_hal.can.keys import CAN
-from thermoctl_hal.can.read import OBJECT_TYPES, read_object_name
 from thermoctl_hal.ethercat.keys import ETHERCAT
 
 LONGEST_WATCHDOG_S = 6.5535
@@ -142,7 +140,7 @@ def _letter(types: Mapping[Object, str], item: Object, node: Node, key: str) -> 
 
 def _start_up(node: Node, types: Mapping[Object, str]) -> tuple[Object, str, int]:
     w = Section(node, "start_up")
-    v = take(w, CAN["start_up"])
+    v = take(w, START_UP)
     w.end()
     item = Object(v["index"], v["sub"])
     letter = _letter(types, item, node, "start_up")

@@ -8,8 +8,8 @@ from typing import Any
 
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.cia402 import CONTROL_WORD
 from thermoctl_hal.base.profile import Object, typed
-from thermoctl_hal.can.cia402 import CONTROL_WORD
 from thermoctl_hal.ethercat.read import Ethercat, Place
 
 OUTPUT_CONTROL = 0x0814  # control byte of sync manager 2, the outputs

@@ -29,9 +29,9 @@ from typing import Any
 
 from thermoctl.extras import load
 from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.line import NETWORK, open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
-from thermoctl_hal.serial.line import NETWORK, open_port
 
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """Modbus function code that reads a kind."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 
 from thermoctl_hal.base.key import REQUIRED, Key
-from thermoctl_hal.buses import BUSES
 from thermoctl_hal.can.keys import CAN
 from thermoctl_hal.ethercat.keys import ETHERCAT
 from thermoctl_hal.modbus.keys import MODBUS
+from thermoctl_hal.profiles.buses import BUSES
 from thermoctl_hal.serial.keys import SERIAL
 
 PROFILE: dict[str, tuple[Key, ...]] = {

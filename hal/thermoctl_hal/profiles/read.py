@@ -11,7 +11,7 @@ from thermoctl_hal.base.key import take
 from thermoctl_hal.base.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
 from thermoctl_hal.base.text_file import while_same
 from thermoctl_hal.base.units import dbc_unit, is_convertible
-from thermoctl_hal.buses import BUSES, part
+from thermoctl_hal.profiles.buses import BUSES, part
 from thermoctl_hal.profiles.keys import PROFILE
 from thermoctl_hal.profiles.read_drive import read_amplifier
 from thermoctl_hal.serial.read import read_line

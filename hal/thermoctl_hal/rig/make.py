@@ -10,8 +10,8 @@ from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device
-from thermoctl_hal.buses import BUSES, part
 from thermoctl_hal.profiles.bind import bind, check_rig, file_warnings, rig_notes
+from thermoctl_hal.profiles.buses import BUSES, part
 from thermoctl_hal.rig.axes import AxisBackend
 from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.devices import DevicesBackend

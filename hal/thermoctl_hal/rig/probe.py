@@ -14,13 +14,13 @@ from typing import Any
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, ROLES, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding, Bound, limits_of
 from thermoctl_hal.base.device import Device
+from thermoctl_hal.base.line import open_port
 from thermoctl_hal.base.profile import ERROR_CODE, Assumed, Cia402, LineSettings, Object, Profile, typed
 from thermoctl_hal.base.wire import EXTENDED, read_available
 from thermoctl_hal.can.bus import open_can
-from thermoctl_hal.can.cia402 import Objects, Sdo
+from thermoctl_hal.can.set_up import Objects, Sdo
 from thermoctl_hal.modbus.link import FUNCTIONS, Link, NoAnswer
 from thermoctl_hal.rig.make import driver
-from thermoctl_hal.serial.line import open_port
 
 SHOWN_BYTES, FIRST_REGISTERS, PAUSE_S = 256, 10, 0.002
 

@@ -16,10 +16,10 @@ from typing import Any
 from thermoctl_hal.base.backend import Sample
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device
+from thermoctl_hal.base.line import LineReader, open_port
 from thermoctl_hal.base.message import with_address
 from thermoctl_hal.base.profile import Assumed, BinaryFrame, TextField, TextLine, typed
 from thermoctl_hal.base.wire import Framer, checksum, read_available, wait_readable
-from thermoctl_hal.serial.line import LineReader, open_port
 from thermoctl_hal.serial.shared_line import SharedLine, join, leave
 from thermoctl_hal.serial.text_number import cut_short, number, shown, why_no_match, why_no_number
 

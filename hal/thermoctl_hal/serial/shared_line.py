@@ -10,9 +10,9 @@ import contextlib
 import threading
 from typing import Protocol
 
+from thermoctl_hal.base.line import open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import read_available
-from thermoctl_hal.serial.line import open_port
 
 
 class Asked(Protocol):

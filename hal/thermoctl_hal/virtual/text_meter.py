@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 from thermoctl_hal.base.binding import Binding
+from thermoctl_hal.base.line import LineReader
 from thermoctl_hal.base.profile import TextField, TextLine, typed
-from thermoctl_hal.serial.line import LineReader
 from thermoctl_hal.virtual.device import PtyDevice
 from thermoctl_hal.virtual.plants import Readings
 

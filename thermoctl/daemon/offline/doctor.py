@@ -36,6 +36,7 @@ from thermoctl.recording.writer import disk_warning
 from thermoctl.rig.channels import AMPLIFIER_STATES
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
+from thermoctl_hal.base.latency_timer import latency_timer_ms
 from thermoctl_hal.rig.make import (
     device_notes,
     device_warnings,
@@ -44,7 +45,6 @@ from thermoctl_hal.rig.make import (
     make_backends,
     whole_frames,
 )
-from thermoctl_hal.serial.latency_timer import latency_timer_ms
 
 
 def check(settings: Settings) -> int:

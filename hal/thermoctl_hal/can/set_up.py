@@ -17,6 +17,7 @@ import time
 
 from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.cia402 import CONTROL_WORD, STANDARD_TYPES
 from thermoctl_hal.base.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
 from thermoctl_hal.base.wire import CanPort
 from thermoctl_hal.can.eds import read_eds
@@ -25,7 +26,6 @@ SYNC_ID, NMT_ID = 0x080, 0x000
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
 HEARTBEAT_LOST = 0x8130  # CiA 301 error code of a missing heartbeat
 PDO_INVALID, PDO_NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a PDO's COB-ID
-CONTROL_WORD = Object(0x6040)
 DRIVE_PROFILE = 402  # lower half of object 0x1000: CiA 402
 PDO_BYTES = 8
 LISTEN_S, LISTEN_BEATS = 0.1, 5
@@ -34,17 +34,6 @@ periods."""
 DOUBLE_ANSWERS = 3  # this many second answers to a request prove that two devices share the node id
 _FORMATS = {0x01: "B", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
 """Data types of CiA 301 (BOOLEAN, INTEGER8 .. 32, UNSIGNED8 .. 32) and their letters in `struct`."""
-
-
-STANDARD_TYPES = {
-    0x1000: "uint32", 0x1016: "uint32", 0x1017: "uint16", 0x603F: "uint16", 0x6040: "uint16", 0x6041: "uint16",
-    0x6060: "int8", 0x6061: "int8", 0x6064: "int32", 0x606C: "int32", 0x6071: "int16", 0x6072: "uint16",
-    0x6073: "uint16", 0x6075: "uint32", 0x6076: "uint32", 0x6077: "int16", 0x6078: "int16", 0x6079: "uint32",
-    0x607A: "int32", 0x607F: "uint32", 0x6080: "uint32", 0x6081: "uint32", 0x6083: "uint32", 0x6084: "uint32",
-    0x6085: "uint32", 0x6087: "uint32", 0x60B1: "int32", 0x60B2: "int16", 0x60F4: "int32", 0x60FF: "int32",
-    0x60FD: "uint32", 0x6502: "uint32",
-}  # fmt: skip
-"""Types of objects that CiA 301 and CiA 402-2 define: for drives without an EDS file."""
 
 
 class Objects:

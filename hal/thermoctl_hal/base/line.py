@@ -16,8 +16,8 @@ import termios
 import serial
 
 from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.latency_timer import set_latency_timer
 from thermoctl_hal.base.profile import LineSettings
-from thermoctl_hal.serial.latency_timer import set_latency_timer
 
 NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter
