@@ -21,7 +21,7 @@ def module(source: Path) -> str:
     return ".".join(inside.with_suffix("").parts)
 
 
-# Beside the package, under share/thermoctl: thermoctl/shipped.py finds them.
+# Beside the package, under share/thermoctl: thermoctl/files/shipped.py finds them.
 files = sorted(
     p for root in ("config", "docs/examples", "systemd") for p in Path(root).rglob("*.*") if p.is_file()
 )

@@ -9,8 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from thermoctl import safe_file
-from thermoctl.safe_file import WriteError, make_folder, move, part_file, whole_file, whole_files, write_text
+from thermoctl.files import safe_file
+from thermoctl.files.safe_file import (
+    WriteError,
+    make_folder,
+    move,
+    part_file,
+    whole_file,
+    whole_files,
+    write_text,
+)
 
 
 def test_a_link_stays_a_link_and_the_mode_stays(tmp_path):
@@ -51,7 +59,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, name, why):
 
 
 def test_a_device_or_a_pipe_is_written_directly():
-    code = "from thermoctl.safe_file import write_text; write_text('/dev/stdout', 'hello'); write_text('/dev/null', 'x')"
+    code = "from thermoctl.files.safe_file import write_text; write_text('/dev/stdout', 'hello'); write_text('/dev/null', 'x')"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "hello"
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
 

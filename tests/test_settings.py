@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from thermoctl.configuration import settings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.tuning import write_values
-from thermoctl.yamlfile import InputError
 
 SIMULATED = Path(__file__).parent.parent / "config" / "simulated.yaml"
 TEXT = SIMULATED.read_text()

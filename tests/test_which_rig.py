@@ -4,8 +4,8 @@ import pytest
 
 from thermoctl import cli
 from thermoctl.configuration import which_rig
-from thermoctl.shipped import COPIED, shipped
-from thermoctl.yamlfile import InputError
+from thermoctl.files.shipped import COPIED, shipped
+from thermoctl.files.yamlfile import InputError
 
 COMMANDS = {  # every command that means a rig, as it would be typed without --config
     "run": [],

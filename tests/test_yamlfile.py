@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from thermoctl.yamlfile import InputError, Section, loads
+from thermoctl.files.yamlfile import InputError, Section, loads
 
 TEXT = """\
 name: pump

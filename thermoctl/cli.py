@@ -14,7 +14,7 @@ from thermoctl.command import AXIS
 from thermoctl.commands import BY_PURPOSE, COMMANDS, GROUPS, call, takes_axis
 from thermoctl.configuration import which_rig
 from thermoctl.extras import lacking
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 EXTRAS = {
     "rig": {

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import shtab
 
-from thermoctl import __version__, safe_file
-from thermoctl.yamlfile import InputError
+from thermoctl import __version__
+from thermoctl.files import safe_file
+from thermoctl.files.yamlfile import InputError
 
 PLACES = {  # places below the root where man and the shells look for local files
     "man": "usr/local/share/man/man1/thermoctl.1",

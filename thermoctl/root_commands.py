@@ -197,7 +197,7 @@ TABLE: Table = {
         command(
             "init",
             "copy configurations, device profiles, plants and examples into a folder, to start from",
-            "thermoctl.shipped:init",
+            "thermoctl.files.shipped:init",
             "folder",
             argument("folder", nargs="?", default=".", metavar="DIR", help="the folder (default: this one)"),
         ),
@@ -246,7 +246,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.hours is None:
         from thermoctl.daemon import supervisor
-        from thermoctl.yamlfile import InputError
+        from thermoctl.files.yamlfile import InputError
 
         if args.axis:
             raise InputError(
@@ -261,7 +261,7 @@ def run(args: argparse.Namespace) -> int:
 
 def virtual_rig(settings: Any, line: str) -> int:
     """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
-    from thermoctl.yamlfile import InputError
+    from thermoctl.files.yamlfile import InputError
     from thermoctl_hal.virtual.rig import main
 
     if settings.hal.backend != "devices":
@@ -303,7 +303,7 @@ def effects(args: argparse.Namespace) -> int:
 
 def diagnose(args: argparse.Namespace) -> int:
     """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
-    from thermoctl.yamlfile import InputError
+    from thermoctl.files.yamlfile import InputError
 
     if args.explain:
         from thermoctl.diagnosis.show import explained

@@ -18,10 +18,10 @@ from pathlib import Path
 from thermoctl import __version__
 from thermoctl.configuration.settings import Settings, effective
 from thermoctl.daemon.service import journal, log_path
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.reader import export, info
 from thermoctl.recording.writer import FULL, recording_files
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError
 
 LOG_BYTES = 1_000_000  # from the log's end
 HIDDEN = "(left out)"

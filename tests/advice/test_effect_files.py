@@ -10,9 +10,9 @@ from thermoctl.advice.effect_files import check_file
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.effect import FORMS, PARTS, SHAPES, SYMBOLS
 from thermoctl.diagnosis.hypothesis.places import PLACES
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import Section
 from thermoctl.plant import load
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import Section
 
 PAGE = (Path(__file__).parents[2] / "docs/reference/effect-files.md").read_text()
 WORKED = re.search(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[1]

@@ -11,11 +11,11 @@ from tests.checks.rigs import PLANTS, inputs, rig
 from thermoctl.advice.plan import plan
 from thermoctl.cli import main
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.simulation.simulate import compile_plant
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError
 
 EFFECTS = catalogue((CATALOGUE,))
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import thermoctl as tc
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 HEATER = Path(__file__).parents[2] / "docs/examples/heater"
 

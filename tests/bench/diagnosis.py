@@ -45,13 +45,13 @@ from thermoctl.diagnosis.search.gains import Direction, parameter_values
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import groups_of, sharpened
 from thermoctl.diagnosis.search.screening import screened
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.fitting.estimate import report
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import Excitation, SimulationError
-from thermoctl.yamlfile import InputError
 
 SHORT, MOST = 8, 3
 

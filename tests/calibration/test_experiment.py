@@ -12,11 +12,11 @@ from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import tuner
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.daemon.tick.assemble import compensator
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import INDEX
-from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = 50  # heat capacities are divided by it: an hour passes in 72 s

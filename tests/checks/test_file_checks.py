@@ -5,8 +5,8 @@ import pytest
 from tests.plants import TWO_BLOCKS
 from thermoctl import cli
 from thermoctl.checks.file import file_findings
+from thermoctl.files.shipped import shipped
 from thermoctl.plant import load, loads
-from thermoctl.shipped import shipped
 
 OPEN = TWO_BLOCKS.replace("rate: heat, unit: W", "rate: P * heat, unit: W").replace(
     "  C_1:", "  P: {value: 1, range: [0.1, 10]}\n  C_1:"

@@ -20,9 +20,9 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.result import contract
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, loads
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 CONFIDENT = 0.9
 RIG = "two blocks"

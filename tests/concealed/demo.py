@@ -32,6 +32,7 @@ from tests.concealed.judge import snr
 from tests.concealed.rig import Scene
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.diagnosis import run as diagnosis
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import program
 from thermoctl.identify.linearise import linearise
 from thermoctl.plant import load, save
@@ -40,7 +41,6 @@ from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.report import page
-from thermoctl.yamlfile import InputError
 
 SIGMAS = 120.0
 LATE = 1e9  # seconds: the joint is as it is after the recordings

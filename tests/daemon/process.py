@@ -13,7 +13,7 @@ import psutil
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.tick.assemble import shared_name
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 120.0

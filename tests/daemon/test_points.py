@@ -18,11 +18,11 @@ from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.daemon.recorder import law_metadata
 from thermoctl.daemon.tick.shared import Shared
 from thermoctl.daemon.views import metrics
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.reader import read_rows
 from thermoctl.recording.writer import FULL, RecordingWriter, recording_files
 from thermoctl.rig.channels import DEFAULT, MAX_POINTS, of_text
 from thermoctl.rig.signals import AT, of_channels, recorded_states
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.virtual.rig import VirtualRig
 
 SPINDLE = ("motor", "spindle_front_bearing", "rear_bearing", "frame")

@@ -9,7 +9,7 @@ from tests.rigs.axes import simulated_axes
 from thermoctl import cli
 from thermoctl.configuration.settings import load_rig, load_settings
 from thermoctl.daemon.tick.assemble import shared_name
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 
 def test_an_axis_has_the_settings_of_a_rig_of_its_own(tmp_path):

@@ -14,8 +14,8 @@ from tests.daemon.process import ROOT, Daemon
 from thermoctl.cli import main
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import lock, service
+from thermoctl.files.yamlfile import InputError
 from thermoctl.manual import PLACES
-from thermoctl.yamlfile import InputError
 
 
 # ------------------------------------------------------------------------------------------------ lock and socket

@@ -12,8 +12,8 @@ from thermoctl.daemon.answers.snapshot import latency
 from thermoctl.daemon.tick.clock import now_ns, sleep_until
 from thermoctl.daemon.tick.ring import Box, Histogram, Mailbox, Record, Ring, unpack_readings
 from thermoctl.daemon.tick.shared import Shared, percentiles
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.signals import OUTPUTS
-from thermoctl.yamlfile import InputError
 
 
 def ring(slots=8, columns=3):

@@ -14,9 +14,9 @@ from thermoctl.daemon.offline.replay import replay
 from thermoctl.daemon.offline.simulate import Simulation, run_simulated
 from thermoctl.daemon.recorder import LAW_VERSION, law_metadata, read_law_metadata
 from thermoctl.daemon.tick.assemble import law_parameters
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.channels import CHANNELS, DEFAULT
 from thermoctl.rig.signals import INDEX, NAMES, SIGNALS
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, ROLES, STALE
 
 

@@ -8,7 +8,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ROLE, STATUS_NAMES, Sample
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.profiles.bind import bind, check_rig

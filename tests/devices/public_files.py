@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.profile import Cia402, Object
 from thermoctl_hal.can.dbc_file import load_dbc
 from thermoctl_hal.can.eds import read_eds

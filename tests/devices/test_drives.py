@@ -14,8 +14,8 @@ import pytest
 
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode
 from tests.devices.harness import HEAD, Rig, wait
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, ROLE, STALE
 from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
 from thermoctl_hal.profiles.read import load_profile

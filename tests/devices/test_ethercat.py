@@ -14,9 +14,9 @@ from tests.devices.ethercat import INIT, OP, SAFEOP
 from tests.devices.ethercat_cable import Cable, why_not
 from tests.devices.ethercat_devices import Drive, Terminal, coupler
 from tests.devices.harness import Rig
-from thermoctl import yamlfile
 from thermoctl.devices.library import find
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, HardwareError, Sample
 from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
 from thermoctl_hal.profiles.read import load_profile

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.devices.harness import HEAD, make
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, Sample
 from thermoctl_hal.base.units import dbc_unit
 from thermoctl_hal.can.bus import BY_PGN, EXTENDED, is_wanted, pgn_of

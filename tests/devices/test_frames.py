@@ -11,7 +11,7 @@ import zlib
 import pytest
 
 from tests.devices.harness import HEAD, POSITION, Line, make, wait
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import ERROR, ROLE, Sample
 from thermoctl_hal.base.checksum import algorithm, names
 from thermoctl_hal.base.wire import checksum

@@ -2,8 +2,8 @@
 
 import pytest
 
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError, Section
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError, Section
 from thermoctl_hal.base.key import REQUIRED, take
 from thermoctl_hal.profiles.keys import TABLES
 

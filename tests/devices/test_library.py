@@ -14,8 +14,8 @@ from tests.devices.library import CASES, UNTRIED
 from thermoctl import cli
 from thermoctl.devices.library import cited, find
 from thermoctl.devices.new import new
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.profiles.read import load_profile
 from thermoctl_hal.rig.probe import Probe, read_for

@@ -9,8 +9,8 @@ import pytest
 
 from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, Unit, encode, words
 from tests.devices.harness import HEAD, Line, Rig
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError, Sample
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.can.bus import open_can

@@ -9,11 +9,11 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 WEEKS = 3
 RADIATION = 3e-10  # W/K^4; in one recording it is a matter of chance

@@ -13,7 +13,7 @@ from scipy.linalg import blas
 from tests.diagnose.test_engine import LAGGED, _write, written
 from thermoctl.diagnosis import diagnose as diagnosis
 from thermoctl.diagnosis import threads
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 
 def test_two_runs_at_once_on_one_and_on_two_threads_write_the_same_bytes(tmp_path):

@@ -17,11 +17,11 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.result import doubts
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 LEVELS = (0.0, 2.5, 0.8, 0.0, 1.6, 3.0, 0.0, 2.0)
 

@@ -7,8 +7,8 @@ import pytest
 
 import thermoctl as tc
 from thermoctl.cli import main
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.files import loads
-from thermoctl.yamlfile import InputError
 
 PLANT = """format: thermoctl-plant/1
 inputs:

@@ -19,12 +19,12 @@ from thermoctl.diagnosis.experiment.resolve import resolve
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import search
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 CONFIG = Path(__file__).resolve().parents[2] / "config/simulated.yaml"
 BELIEF = """format: thermoctl-plant/1

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from tests.plants import ONE_BLOCK
-from thermoctl import shipped
 from thermoctl.diagnosis.commands import on_interrupt
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import beam as search
+from thermoctl.files import shipped
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 PLANT = Path(shipped.__file__).parents[1] / "config" / "plants" / "actuator_thermal.yaml"
 

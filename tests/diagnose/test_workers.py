@@ -13,12 +13,12 @@ from tests.proof.test_proof import a_dask_by_hand
 from thermoctl.diagnosis import workers as dask_workers
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.workers import cluster
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 LOST = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl.recording.stream import open_stream
 
 SOURCE = Path(__file__).with_name("fault.c")

@@ -12,8 +12,8 @@ import pytest
 
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table
-from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ("recorder and", "tune", "rollback", "save-effect")

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from tests.disk.harness import Writer, tell
-from thermoctl import cli, shipped
+from thermoctl import cli
 from thermoctl.api import diagnosing
 from thermoctl.calibration import steps, wizard
 from thermoctl.configuration.settings import effective, load_settings
@@ -21,6 +21,7 @@ from thermoctl.daemon.views import demo
 from thermoctl.devices import new as devices_new
 from thermoctl.diagnosis import run as diagnosis
 from thermoctl.diagnosis.law.result import save_effect
+from thermoctl.files import shipped
 from thermoctl.identify import modelfile, tuning
 from thermoctl.plant import load
 from thermoctl.recording.files import read_table

@@ -6,10 +6,10 @@ from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.files.shipped import shipped
 from thermoctl.plant import Plant, load, loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.shipped import shipped
 
 TABLED = """\
 format: thermoctl-plant/1

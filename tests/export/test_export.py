@@ -11,10 +11,10 @@ import pytest
 from tests.export.plants import FRICTION, plants, recording
 from thermoctl import cli
 from thermoctl.export.commands import write
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
-from thermoctl.yamlfile import InputError
 
 ALL = plants()
 TOLERANCE = 1e-6  # of each output's range

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.recordings import expanded
-from thermoctl.yamlfile import InputError
 
 
 def test_patterns_and_folders_become_files(tmp_path):

@@ -26,7 +26,7 @@ from typing import Any
 
 import can
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
 from thermoctl_hal.base.wire import Framer
 from thermoctl_hal.can.bus import open_can

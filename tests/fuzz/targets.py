@@ -176,7 +176,7 @@ def modbus() -> tuple[Callable[[bytes], Any], list[bytes]]:
     import socket
     import threading
 
-    from thermoctl import yamlfile
+    from thermoctl.files import yamlfile
     from thermoctl_hal.base.backend import HardwareError, Sample
     from thermoctl_hal.modbus.device import ModbusDevice
     from thermoctl_hal.profiles.bind import bind
@@ -244,7 +244,7 @@ def _recording(suffix: str) -> tuple[Callable[[bytes], Any], list[bytes]]:
         seeds.append(sink.getvalue())
 
     def one(data: bytes) -> None:
-        from thermoctl.yamlfile import InputError
+        from thermoctl.files.yamlfile import InputError
 
         read = _file(data, suffix)
         with contextlib.suppress(InputError):
@@ -297,8 +297,8 @@ def metadata() -> tuple[Callable[[bytes], Any], list[bytes]]:
     from thermoctl.daemon import keep
     from thermoctl.daemon.offline.replay import replay
     from thermoctl.daemon.recorder import law_metadata
+    from thermoctl.files.yamlfile import InputError
     from thermoctl.rig.signals import SIGNALS
-    from thermoctl.yamlfile import InputError
 
     model, parameters = zero_model(), Parameters(kp=0.1, ti_s=1.0, td_s=0.0, output_limit=1.0)
     state = Law(model, parameters, 1e-3).snapshot()
@@ -392,7 +392,7 @@ def _alarm(*_: Any) -> None:
 
 def guarded(one: Callable[[bytes], Any], name: str) -> Callable[[bytes], None]:
     """`one` with its errors judged: InputError is meant, all else is a find, and so are time and memory."""
-    from thermoctl.yamlfile import InputError
+    from thermoctl.files.yamlfile import InputError
 
     def run(data: bytes) -> None:
         try:

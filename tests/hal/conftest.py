@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl.rig.channels import DEFAULT
 from thermoctl_hal.base.backend import ROLE, STATUS_NAMES, Sample
 from thermoctl_hal.virtual.rig import VirtualRig

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tests.hal.conftest import CONFIG, make_settings
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import (
     ABSENT,
     AMP_DISABLED,

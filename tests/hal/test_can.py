@@ -221,7 +221,7 @@ def test_library_port_over_the_virtual_interface():
 
 def test_dbc_device_decodes_what_cantools_encodes(tmp_path):
     from tests.hal.conftest import CONFIG
-    from thermoctl import yamlfile
+    from thermoctl.files import yamlfile
     from thermoctl_hal.base.backend import ROLE
     from thermoctl_hal.can.dbc import DbcDevice
     from thermoctl_hal.profiles.bind import bind

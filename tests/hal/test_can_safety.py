@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from tests.hal.conftest import CONFIG
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import (
     AMP_DISABLED,
     AMP_ENABLED,

@@ -9,7 +9,7 @@ import math
 import pytest
 
 from tests.hal.conftest import CONFIG
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import (
     AMP_DISABLED,
     AMP_ENABLED,

@@ -14,7 +14,7 @@ import tty
 
 import pytest
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
 from thermoctl_hal.modbus.device import LOST_POLLS, ModbusDevice
 from thermoctl_hal.profiles.bind import bind

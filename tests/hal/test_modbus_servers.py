@@ -14,8 +14,8 @@ import pytest
 
 from tests.devices.harness import HEAD
 from tests.hal.test_modbus_faults import crc
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, HardwareError, Sample
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.modbus import link as links

@@ -13,7 +13,6 @@ import pytest
 
 from tests.hal.conftest import CONFIG
 from tests.limits import OFF
-from thermoctl import yamlfile
 from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import Parameters, zero_model
 from thermoctl.daemon.answers.display import counter_lines
@@ -22,8 +21,9 @@ from thermoctl.daemon.tick.arrival import device_counters, put_counters, slow_re
 from thermoctl.daemon.tick.clock import now_ns
 from thermoctl.daemon.tick.loop import Axis, run_loop
 from thermoctl.daemon.tick.shared import Shared
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.signals import AT, INDEX
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import ROLE
 from thermoctl_hal.base.wire import Framer
 from thermoctl_hal.profiles.bind import bind

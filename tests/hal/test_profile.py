@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hal.conftest import CONFIG
-from thermoctl import yamlfile
 from thermoctl.configuration.settings import load_settings
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.profiles.bind import bind, check_rig, resolve_port
 from thermoctl_hal.profiles.read import load_profile
 from thermoctl_hal.rig.make import make_devices

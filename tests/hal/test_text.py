@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermoctl import yamlfile
-from thermoctl.yamlfile import InputError
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import ROLE, Sample
 from thermoctl_hal.profiles.bind import bind
 from thermoctl_hal.profiles.read import load_profile

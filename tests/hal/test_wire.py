@@ -12,7 +12,7 @@ import pytest
 
 from tests.hal.conftest import CONFIG
 from thermoctl.configuration.settings import load_settings
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import (
     ABSENT,
     AMP_DISABLED,

@@ -17,8 +17,8 @@ from tests.daemon.process import forget
 from tests.hal.conftest import CONFIG, free_port
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.virtual.rig import tell
 
 pytestmark = pytest.mark.slow

@@ -16,8 +16,8 @@ import pytest
 from tests.daemon.process import LIMIT_S, Daemon, wait
 from tests.hazards.harness import ROOT, ROWS, Row
 from thermoctl.daemon.tick.assemble import shared_name
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table
-from thermoctl.yamlfile import InputError
 
 pytestmark = pytest.mark.slow
 

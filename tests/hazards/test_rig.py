@@ -11,7 +11,7 @@ from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.daemon.tick.ring import Histogram
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 
 def finish(rig, hazard, limit, ticks, found, way):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.hazards.harness import ROOT, HazardRig, say
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ROLE, Sample
 from thermoctl_hal.base.wire import Framer
 from thermoctl_hal.rig.devices import DevicesBackend

@@ -8,10 +8,10 @@ from itertools import product
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modal
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.statespace import StateSpace
-from thermoctl.yamlfile import InputError
 
 
 def time_constant_s(model: Expansion) -> float:

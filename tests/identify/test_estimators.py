@@ -9,9 +9,9 @@ from tests.identify.peers import time_constant_s
 from tests.reproduction import paper
 from tests.reproduction.sensors import choose_sensors
 from thermoctl.control.model import CompensatorModel, zero_model
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import expansion, filter, modelfile, online, tuning
 from thermoctl.identify.statespace import StateSpace
-from thermoctl.yamlfile import InputError
 
 
 def motion(n=9000, seed=0):

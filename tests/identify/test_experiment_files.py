@@ -5,9 +5,9 @@ import pytest
 
 from thermoctl.calibration.commands import record
 from thermoctl.cli import main
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.recording.files import read_table
-from thermoctl.yamlfile import InputError
 
 GOOD = """format: thermoctl-experiments/1
 experiments:

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from tests.identify.peers import identify_validated, initial_state
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modal, refine
 from thermoctl.identify.statespace import StateSpace
-from thermoctl.yamlfile import InputError
 
 TAU = np.array([20.0, 150.0, 900.0])
 

@@ -24,10 +24,10 @@ from thermoctl.daemon.views import dashboard, monitor
 from thermoctl.daemon.views import demo as view
 from thermoctl.daemon.views.metrics import metrics
 from thermoctl.daemon.views.watch import Watch
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.history import history
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.rig.signals import INDEX, POINTS, SIGNALS
-from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 20.0

@@ -23,9 +23,9 @@ from thermoctl.configuration.settings import load_settings
 from thermoctl.control import arming
 from thermoctl.daemon.answers.snapshot import status
 from thermoctl.daemon.control_socket import Connection, ask
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import Schedule
 from thermoctl.rig.signals import INDEX
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import ROLE
 from thermoctl_hal.simulated.faulty import Fault, FaultInjector
 

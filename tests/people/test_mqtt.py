@@ -11,8 +11,8 @@ import time
 import pytest
 
 from thermoctl import cli
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.signals import INDEX
-from thermoctl.yamlfile import InputError
 
 LIMIT_S = 20.0
 BROKER = shutil.which("mosquitto", path=os.environ["PATH"] + ":/usr/sbin")

@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 from tests.export.plants import plants, recording
-from thermoctl import yamlfile
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
@@ -21,10 +20,11 @@ from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 NOISE = {"degC": 0.05, "m": 1e-6}
 HIDDEN = {  # effect, place as YAML, values; an effect of a drive is named by its input where the plant is an FMU

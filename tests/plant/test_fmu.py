@@ -15,12 +15,12 @@ from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.export.commands import write
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant.native.fmu import opened
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 HEATER = Path(__file__).parents[2] / "docs/examples/heater"
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>

@@ -5,7 +5,7 @@ import pytest
 
 import thermoctl as tc
 from thermoctl import cli
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 PLANT = """format: thermoctl-plant/1
 inputs: {heat: {unit: W}, air: {unit: degC, role: ambient}}

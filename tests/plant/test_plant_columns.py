@@ -7,6 +7,7 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from thermoctl import cli
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Conversion
 from thermoctl.plant.recordings import read_recordings
@@ -16,7 +17,6 @@ from thermoctl.recording.files import read_table
 from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.table import Table
 from thermoctl.units import conversion
-from thermoctl.yamlfile import InputError
 
 T = np.arange(0.0, 400.0, 2.0)
 HEAT, AIR = np.where(T < 200, 3.0, 1.0), 22 + T / 400

@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from thermoctl.cli import main
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.linearise import discrete, gains, linearise, thermal
 from thermoctl.identify.modelfile import load_model
 from thermoctl.plant import extended, load
@@ -14,7 +15,6 @@ from thermoctl.plant.show import layout
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 THERMAL = "config/plants/actuator_thermal.yaml"
 

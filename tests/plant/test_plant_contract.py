@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.fitting.estimate import updated
 from thermoctl.plant.fitting.refit import fit
@@ -17,7 +18,6 @@ from thermoctl.plant.language import FLICKER_DECADES, ROLES, SensorNoise
 from thermoctl.plant.simulation.sensor import error
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.simulated.rig import PlantRig
 
 BLOCK = """\

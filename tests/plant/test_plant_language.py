@@ -10,9 +10,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant import from_plain, loads
-from thermoctl.yamlfile import InputError
 
 GOOD = {
     "format": "thermoctl-plant/1",

@@ -99,7 +99,7 @@ def test_every_template_is_checked_and_runs(folder, name, capsys):
 
 
 def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
-    from thermoctl.shipped import shipped
+    from thermoctl.files.shipped import shipped
 
     assert {p.stem for p in shipped("config/plants/templates").glob("*.yaml")} == set(TEMPLATES)
     with pytest.raises(SystemExit):

@@ -4,10 +4,10 @@ import re
 from pathlib import Path
 
 from thermoctl import cli
+from thermoctl.files.yamlfile import Section
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads
 from thermoctl.plant.language import ROLES
-from thermoctl.yamlfile import Section
 
 PAGE = (Path(__file__).parents[2] / "docs/reference/plant.md").read_text()
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.bench.scale import block_plant
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 HEAD = "format: thermoctl-plant/1\n"
 PLANTS = {

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import loads
 from thermoctl.units import SYMBOLS, dimension
-from thermoctl.yamlfile import InputError
 
 PLANT = """format: thermoctl-plant/1
 inputs: {{P: {{unit: W}}, air: {{unit: degC}}, v: {{unit: m/s}}}}

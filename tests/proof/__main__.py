@@ -16,8 +16,8 @@ from rich.console import Console
 from tests.proof import tables
 from tests.proof.prove import prove
 from tests.proof.recordings import VARIABLE, real, recordings_folder, totals
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.batch import Reporter
-from thermoctl.yamlfile import InputError
 
 
 def _parser() -> argparse.ArgumentParser:

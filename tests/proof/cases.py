@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from thermoctl.files.yamlfile import InputError, load
 from thermoctl.fleet.jobs import Job
-from thermoctl.yamlfile import InputError, load
 
 RECORDINGS = (".csv", ".parquet", ".arrow")
 

@@ -21,11 +21,11 @@ from tests.proof.page import page
 from tests.proof.score import Row, plain, score
 from tests.proof.summary import summary
 from thermoctl import __version__
+from thermoctl.files.safe_file import whole_files, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.batch import OnCase, run_all, run_one
 from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.recording.files import read_table
-from thermoctl.safe_file import whole_files, write_text
-from thermoctl.yamlfile import InputError
 
 
 def prove(

@@ -12,10 +12,10 @@ from typing import Any
 
 from tests.proof.rigs import RIGS, Rig
 from tests.proof.score import CONFIDENT
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.batch import OnCase, run_all, run_one
 from thermoctl.fleet.jobs import Job, Run, outcome
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
 
 VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
 SUFFIX = ".csv"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 SYMMETRIC = ("missing_link", "bending")  # `a-b` and `b-a` name the same place
 NAMING = ("explained", "partly_explained", "ambiguous")  # verdicts that state a name

@@ -20,9 +20,9 @@ from tests.proof import score, statistics, summary, tables
 from tests.proof.cases import find_jobs, read_answers
 from tests.proof.page import page as page_of
 from tests.proof.prove import prove
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.batch import run_all, run_one
 from thermoctl.fleet.jobs import program_files
-from thermoctl.yamlfile import InputError
 
 
 def finding(effect: str, where: str, probability: float, **more) -> dict:

@@ -19,7 +19,7 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(CHECKOUT), str(CHECKOUT / f".venv/lib/python3.{sys.version_info[1]}/site-packages")]
 
-from thermoctl import yamlfile  # noqa: E402
+from thermoctl.files import yamlfile  # noqa: E402
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, ROLE  # noqa: E402
 from thermoctl_hal.can.bus import LibraryPort, open_can  # noqa: E402
 from thermoctl_hal.can.drive import Cia402Device  # noqa: E402

@@ -5,8 +5,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.logger import read_recording
-from thermoctl.yamlfile import InputError
 
 ISO = "2026-03-01 10:00:0"
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.logger import parsed_columns, read_recording
-from thermoctl.yamlfile import InputError
 
 T, X = [0.0, 1.0, 2.5], [21.5, np.nan, 1e-3]
 

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.logger import read_recording
-from thermoctl.yamlfile import InputError
 
 EXAMPLES = int(os.environ.get("THERMOCTL_READINGS", "60"))
 BEGIN = datetime(2026, 3, 1, 9, 59, 58, tzinfo=UTC)

@@ -11,13 +11,13 @@ import pytest
 from test_writer import feed, only, settings, ticks
 
 from thermoctl.cli import main
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.reader import export, info, read_rows, recover
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter
 from thermoctl.rig.signals import INDEX
-from thermoctl.yamlfile import InputError
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 numbers = st.one_of(st.just(float("nan")), st.floats(allow_nan=False, allow_infinity=False, width=64))
 names = (

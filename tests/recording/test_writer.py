@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import thermoctl.recording.writer as writing
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, TIER, RecordingWriter, recording_files
 from thermoctl.rig.signals import INDEX, SIGNALS
-from thermoctl.yamlfile import InputError
 
 RNG = np.random.default_rng(1)
 

@@ -38,10 +38,10 @@ from thermoctl.calibration.chain import (
 )
 from thermoctl.calibration.recorded import Recorded, filled
 from thermoctl.control.model import CompensatorModel
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import filter
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.statespace import StateSpace
-from thermoctl.yamlfile import InputError
 
 ORDER = 12
 LONGEST_S = 36000.0  # no expansion takes longer than ten hours

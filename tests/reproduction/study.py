@@ -16,7 +16,7 @@ from tests.reproduction.report import report
 from tests.reproduction.rigs import CHAMBER, DISTURBANCES
 from tests.reproduction.seeds import Kept, SeedResult, one_seed
 from thermoctl.calibration.schedules import of_config
-from thermoctl.safe_file import write_text
+from thermoctl.files.safe_file import write_text
 
 SEEN, FRESH = (*range(12), *range(1000, 1012)), tuple(range(2000, 2012))
 """Seeds. The methods and the rigs (rigs.PAPER_SCALE, rigs.HEAT_W, rigs.CHAMBER, paper.CHOICES,

@@ -10,10 +10,10 @@ from tests.reproduction import closed_loop, paper, rigs
 from thermoctl import plant
 from thermoctl.calibration import chain, iso230
 from thermoctl.calibration.recorded import Recorded
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
 from thermoctl.identify.statespace import StateSpace
 from thermoctl.report.page import page, table
-from thermoctl.yamlfile import InputError
 
 ROOT = Path(__file__).parents[2]
 

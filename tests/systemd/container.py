@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from thermoctl.daemon.control_socket import ask
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOTFS = ROOT / "build/systemd/rootfs"

@@ -20,8 +20,8 @@ from tests.concealed import generate
 from tests.proof.recordings import VARIABLE, rig_job
 from tests.proof.rigs import RIGS, Rig
 from tests.proof.score import Named, Truth, same_place
+from thermoctl.files.yamlfile import load
 from thermoctl.fleet.jobs import Job
-from thermoctl.yamlfile import load
 
 SEEDS = {"closed": 141421, "open": 173205}  # frozen: a table stays comparable with an older one
 FOREIGN = "THERMOCTL_FOREIGN"  # of the environment: the folder of other people's systems

@@ -18,11 +18,11 @@ from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import Thresholds, limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job, Run
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import SimulationError
-from thermoctl.yamlfile import InputError
 
 KEPT = "sought.pickle"
 

@@ -25,7 +25,7 @@ from tests.tune import truth as true
 from tests.tune.rig import LoopRig, Truth, settings_of
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.tune import tune
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 
 GOOD_GAIN, GOOD_DEG = 2.0, 45.0

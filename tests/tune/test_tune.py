@@ -11,10 +11,10 @@ from tests.tune import prove
 from tests.tune.rig import LoopRig, Truth, settings_of
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.tune import Disagrees, tune
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import tuning
 from thermoctl.identify.measured_loop import Timing
 from thermoctl.rig.signals import INDEX
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 
 ROWS = max(INDEX.values()) + 1

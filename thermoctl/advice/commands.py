@@ -16,10 +16,10 @@ from thermoctl.advice.plan import Planned, contract, plan
 from thermoctl.checks.commands import report
 from thermoctl.diagnosis.commands import parsed_limits
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.foreign.logger import options
-from thermoctl.yamlfile import InputError
 
 
 def check_effects(args: argparse.Namespace) -> int:

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoctl import yamlfile
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE
 from thermoctl.diagnosis.hypothesis.effect import read
 from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.files import yamlfile
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError, Node
 from thermoctl.plant import Plant, expression, load
 from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.plant.units import check_units
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError, Node
 
 
 def check_file(path: Path, plants: Sequence[Plant]) -> tuple[str, list[str]]:

@@ -26,13 +26,13 @@ from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Range
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 REST = {"degC": 20.0, "K": 293.15, "degF": 68.0}  # surroundings where nothing states them
 SETTLED = 3.0  # time constants after which a step has come to 95 %

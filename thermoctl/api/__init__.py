@@ -1,7 +1,7 @@
 """The Python interface: plants, simulation, refit and diagnosis on data frames, arrays or files.
 
 Every function takes a plant as a `Plant` or a path. Data are a path, a data frame (pandas, polars), a mapping
-of names to arrays, or a `Table`. Errors in the input are `thermoctl.yamlfile.InputError`.
+of names to arrays, or a `Table`. Errors in the input are `thermoctl.files.yamlfile.InputError`.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from thermoctl.api.fits import Refit
 from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.results import Simulation, joined
 from thermoctl.checks import Finding, checks
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import from_plain, load
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.simulation.initial import last_state, with_start
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
     from thermoctl.api.diagnosing import Diagnosis, diagnose

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import in_parts
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.foreign.units import split_unit
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError, suggest
 
 
 class Frame(Protocol):

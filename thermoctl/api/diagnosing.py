@@ -23,11 +23,11 @@ from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis as Found
 from thermoctl.diagnosis.result import contract
+from thermoctl.files.safe_file import whole_files, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import save
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.report.page import figure
-from thermoctl.safe_file import whole_files, write_text
-from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,11 +10,11 @@ import numpy as np
 
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import profile_curve, residual_panels
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.fitting.estimate import Estimate, report, updated
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.simulation.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
-from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

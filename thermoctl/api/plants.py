@@ -10,10 +10,10 @@ from pathlib import Path
 
 from thermoctl.api.data import Data, tables_of
 from thermoctl.export.commands import SUFFIX, write
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant import language, load, save
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure
-from thermoctl.yamlfile import InputError, suggest
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from thermoctl.calibration.tune import tune as tune_loop
 from thermoctl.calibration.wizard import Wizard
 from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments, modelfile, tuning
 from thermoctl.recording.files import read_table
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 
 MODELS = Path("models")

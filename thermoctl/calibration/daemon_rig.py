@@ -24,13 +24,13 @@ from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.control_socket import Connection, ask
 from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.daemon.tick.shared import Shared
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.identify.tuning import Gains
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
 from thermoctl.rig.signals import AT
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import driving_devices
 

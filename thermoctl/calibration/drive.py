@@ -22,10 +22,10 @@ from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming
 from thermoctl.daemon.control_socket import ask
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.identify.tuning import Gains
 from thermoctl.rig.signals import AT
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import make_devices
 

@@ -14,13 +14,13 @@ from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
 
 ENDED = 3  # exit status of a test that ended early
 

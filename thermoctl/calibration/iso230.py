@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 FEWEST = 2  # approaches to a target, by the standard's estimator of repeatability
 SETTLE_S = 2.0  # settling time after arrival, before an approach is read

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.control import faults
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT, Row, fault_word
-from thermoctl.yamlfile import InputError, suggest
 
 EVERY_RIG = ("power_w", "air_c", "output_reference_um", "position_raw_um", "setpoint_um")
 """Signals of a calibration, besides the points' temperatures."""

@@ -12,9 +12,9 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COPPER_1_K
 from thermoctl.daemon.tick.assemble import compensator
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Schedule
-from thermoctl.yamlfile import InputError, suggest
 
 CUTOFF_HZ = 4.3e-4  # the coil's corner: 1 / (2 pi 370 s), its time constant in test 1 of the paper
 # 13 s: the short ramps for the frequencies above the crossover, the long ones for those below

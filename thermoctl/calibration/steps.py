@@ -20,13 +20,13 @@ from thermoctl.calibration.recorded import Recorded, read
 from thermoctl.calibration.schedules import triangles
 from thermoctl.calibration.tune import Disagrees, tune
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.expansion import Expansion
 from thermoctl.identify.filter import Kalman
 from thermoctl.identify.measured_loop import NOTHING
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import AT
-from thermoctl.yamlfile import InputError
 
 FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to
 SHOWN_S = 3.0  # part of the ramps' recording in the report

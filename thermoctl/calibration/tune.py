@@ -16,11 +16,11 @@ import numpy as np
 from thermoctl.calibration import drive
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.schedules import triangles
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import tuning
 from thermoctl.identify.measured_loop import Measured, Timing, disagreement, measure
 from thermoctl.identify.tuning import Gains, SecondOrder
 from thermoctl.rig.signals import AT
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 
 FASTER = 1.05  # a proposal for a loop with good margins must raise kp/ti by this factor

@@ -35,13 +35,13 @@ from thermoctl.calibration.report import report
 from thermoctl.calibration.schedules import of_config, span
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.configuration.settings import Settings, effective
+from thermoctl.files.safe_file import make_folder, move, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
-from thermoctl.safe_file import make_folder, move, write_text
-from thermoctl.yamlfile import InputError
 
 TESTS = ("test_1", "test_2", "test_3", "test_4a", "test_4b")
 RESULTS: dict[str, type[steps.Result]] = {

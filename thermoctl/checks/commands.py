@@ -10,11 +10,11 @@ from typing import TextIO
 
 from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, commands, load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.foreign.logger import options, print_notes
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 
 def check(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from math import gcd, log
 import numpy as np
 
 from thermoctl.checks.finding import Finding
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting import refit
@@ -19,7 +20,6 @@ from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Input
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 ALARM = 1e-6  # false alarms a column and recording
 SIGMAS = 6.0

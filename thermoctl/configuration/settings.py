@@ -23,6 +23,7 @@ from typing import Any
 import yaml
 
 from thermoctl.control.limits import Limits
+from thermoctl.files.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 from thermoctl.rig.channels import (
     CODES,
     DEFAULT,
@@ -35,7 +36,6 @@ from thermoctl.rig.channels import (
 from thermoctl.rig.option import Option, option
 from thermoctl.rig.signals import Row, of_channels
 from thermoctl.units import conversion, ratio
-from thermoctl.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
 
 TEMPERATURES = "temperatures_c"
 """In a mapping of limits: default for the temperatures of all points without an entry of their own."""

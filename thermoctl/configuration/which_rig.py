@@ -12,8 +12,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError
 
 FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
 

@@ -30,7 +30,7 @@ from thermoctl.daemon.tick import arrival
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.daemon.tick.loop import RELOAD
 from thermoctl.daemon.tick.shared import TRIAL, Shared
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.rig.make import can_drive
 
 MAX_LINE = 65536  # bytes of one request

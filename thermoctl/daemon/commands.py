@@ -12,7 +12,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.answers.display import counter_lines, fault_lines, value_lines
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.lock import holder
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 
 def request(settings: Settings, command: str, as_json: bool, value: float | None = None) -> int:

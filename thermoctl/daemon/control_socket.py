@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 
 def settled(now: dict[str, Any]) -> bool:

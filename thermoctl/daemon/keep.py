@@ -21,7 +21,7 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.recorder import decode, encode
-from thermoctl.safe_file import write_text
+from thermoctl.files.safe_file import write_text
 
 KEEP_S = 600.0  # older estimates are useless for the rig's slow parts
 EVERY_S = 5.0  # time between two savings by the supervisor

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 # `hold` retries for this time. To test the lock, `holder` in another process takes it for a shorter time.
 PROBE_S = 0.2

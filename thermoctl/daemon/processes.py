@@ -21,8 +21,8 @@ from thermoctl.daemon.reload import reload_settings
 from thermoctl.daemon.tick import loop as loops
 from thermoctl.daemon.tick.assemble import compensator, law_parameters, shared_name
 from thermoctl.daemon.tick.shared import BEATS, NO_MODEL, RESUMED, Shared
+from thermoctl.files.yamlfile import InputError
 from thermoctl.log import bind, console_log, failed
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.make import make_backends, slow_devices

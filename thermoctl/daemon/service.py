@@ -21,9 +21,9 @@ from thermoctl.configuration.settings import Settings, load_rig
 from thermoctl.daemon.control_socket import ask, settled
 from thermoctl.daemon.lock import holder
 from thermoctl.daemon.tick.loop import die_with_parent
-from thermoctl.safe_file import make_folder, write_text
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import make_folder, write_text
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError
 
 START_S = 90.0  # as TimeoutStartSec= of the unit: devices connect before the first tick
 STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills them

@@ -50,9 +50,9 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.shared import LOOP_PID, Shared
 from thermoctl.daemon.unsaved import Unsaved
+from thermoctl.files.safe_file import WriteError
+from thermoctl.files.yamlfile import InputError
 from thermoctl.log import bind, console_log, take_over
-from thermoctl.safe_file import WriteError
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import disable_amplifier
 

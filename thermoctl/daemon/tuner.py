@@ -17,13 +17,13 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.tick.shared import TUNING, Shared
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile
 from thermoctl.identify.measured_loop import SLIPS
 from thermoctl.identify.online import Tuner
 from thermoctl.rig.channels import AT as CHANNEL_AT
 from thermoctl.rig.channels import DEFAULT, Channels
 from thermoctl.rig.signals import AT, of_channels
-from thermoctl.yamlfile import InputError
 
 INTERVAL_S = 0.5
 PROPOSE_S = 600.0  # rig time between two checks of the proposal

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError, load, suggest
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError, load, suggest
 from thermoctl_hal.base.profile import Profile
 from thermoctl_hal.profiles.read import load_profile
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.profiles.buses import BUSES
 from thermoctl_hal.profiles.keys import TABLES

@@ -27,11 +27,11 @@ from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import sentences, what_next
 from thermoctl.diagnosis.show import read
 from thermoctl.diagnosis.workers import cluster
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.table import Table as Recording
-from thermoctl.yamlfile import InputError
 
 QUIET_S = 5.0  # seconds between two lines on the same stage
 

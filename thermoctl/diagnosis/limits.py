@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from thermoctl import yamlfile
-from thermoctl.shipped import shipped
+from thermoctl.files import yamlfile
+from thermoctl.files.shipped import shipped
 
 
 @dataclass(frozen=True)

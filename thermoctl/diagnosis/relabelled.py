@@ -27,9 +27,9 @@ from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 GAINS = (0.3, 1.5)  # of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for degC
 HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all of it

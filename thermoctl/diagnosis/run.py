@@ -28,14 +28,14 @@ from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis, contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.extras import lacking
+from thermoctl.files.safe_file import whole_files, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, save
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 from thermoctl.report.page import page
-from thermoctl.safe_file import whole_files, write_text
-from thermoctl.yamlfile import InputError
 
 STOPPED = (
     "stopped by hand after {} refits: probabilities compare the hypotheses that were tried; what was not tried may be "

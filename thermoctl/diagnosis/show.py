@@ -12,7 +12,7 @@ from rich.table import Table
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.report.explain import explain, why
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.files.yamlfile import InputError, suggest
 
 
 def explained(folder: str, effect: str | None = None) -> int:

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.cores import elsewhere
-from thermoctl.yamlfile import InputError
 
 CONNECT_S = 20.0  # longest wait for the scheduler
 

@@ -11,13 +11,13 @@ from thermoctl.export.c import c_source
 from thermoctl.export.fmu import write_fmu
 from thermoctl.export.python import python_source
 from thermoctl.export.values import values
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.equations import Equations
 from thermoctl.recording.foreign.logger import options
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
 
 SUFFIX = {"fmu": ".fmu", "python": ".py", "c": ".c"}
 

@@ -18,13 +18,13 @@ from xml.sax.saxutils import quoteattr
 from thermoctl import __version__
 from thermoctl.export.c import core, time_jumps
 from thermoctl.export.values import Values, first_outputs
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.native.build import compiler
 from thermoctl.plant.simulation.equations import Equations
-from thermoctl.safe_file import whole_file
 from thermoctl.units import conversion, dimension
-from thermoctl.yamlfile import InputError
 
 _PLATFORM = {"linux": ("linux64", ".so"), "darwin": ("darwin64", ".dylib")}
 _BASES = {"kg": "kg", "m": "m", "s": "s", "A": "A", "K": "K", "mol": "mol", "cd": "cd"}

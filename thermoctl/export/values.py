@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.equations import Equations
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from typing import Any, TextIO
 from thermoctl import __version__
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.extras import load
+from thermoctl.files.safe_file import make_folder, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job, Run, done
-from thermoctl.safe_file import make_folder, write_text
-from thermoctl.yamlfile import InputError
 
 RETRIES = 3  # number of workers that may die on one case before it counts as failed
 

@@ -16,6 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from thermoctl.configuration.settings import load_settings
+from thermoctl.files.safe_file import make_folder
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.fleet import live
 from thermoctl.fleet.batch import Reporter, cluster, run_all
 from thermoctl.fleet.health import Summary, summarise
@@ -24,8 +26,6 @@ from thermoctl.fleet.laws import comparisons, side_by_side
 from thermoctl.fleet.recordings import find_recordings, rig_of
 from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
-from thermoctl.safe_file import make_folder
-from thermoctl.yamlfile import InputError, suggest
 
 
 def fleet(

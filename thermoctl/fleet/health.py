@@ -15,6 +15,7 @@ import numpy as np
 
 from thermoctl.control import recorded_faults
 from thermoctl.control.arming import ARMED
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.recordings import local, rig_of
 from thermoctl.plant import load
 from thermoctl.plant.fitting.estimate import report
@@ -23,7 +24,6 @@ from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import join_fault_words
-from thermoctl.yamlfile import InputError
 
 ROWS = 4000  # a longer recording is thinned to about this many rows before a fit
 SECONDS_PER_HOUR = 3600.0

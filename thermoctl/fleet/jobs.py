@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE
-from thermoctl.shipped import shipped
+from thermoctl.files.shipped import shipped
 
 _SOURCE = (".py", ".pyx", ".pxd", ".h")  # suffixes of code
 

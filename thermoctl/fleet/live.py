@@ -15,11 +15,11 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.misfit import Alarm, Misfit
 from thermoctl.daemon.tick.assemble import compensator
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 from thermoctl.recording.writer import TIER, recording_files
-from thermoctl.yamlfile import InputError
 
 BEFORE_S = 1800.0  # length of the part before the alarm, when the model still fitted
 STRIDE = 10  # rows of the 10 Hz tier in a second

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.writer import NAME, TIER
-from thermoctl.yamlfile import InputError
 
 SUFFIXES = (".parquet", ".csv", ".arrow", TIER)
 

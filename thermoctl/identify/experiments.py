@@ -21,8 +21,8 @@ from typing import Protocol
 import numpy as np
 
 from thermoctl.control import arming, faults
+from thermoctl.files.yamlfile import InputError, Node, load, suggest
 from thermoctl.rig.signals import AT, fault_word
-from thermoctl.yamlfile import InputError, Node, load, suggest
 
 FORMAT = "thermoctl-experiments/1"
 SETPOINT = "setpoint_um"

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, optimize
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, _c
-from thermoctl.yamlfile import InputError
 
 
 def sensor_variance(step_k: float, noise_k: float) -> float:

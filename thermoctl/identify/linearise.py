@@ -24,10 +24,10 @@ import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
 from thermoctl.control.model import CompensatorModel
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Output, Plant
 from thermoctl.rig.channels import DEFAULT, Channels
-from thermoctl.yamlfile import InputError
 
 AIR, VOLTAGE, CURRENT, POWER, ERROR = "air_c", "voltage_v", "current_a", "power_w", "position_error_um"
 HEAT_DENSITY = 0.05  # W^2 s: 0.03 W of unknown heat in each body over a minute

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.tuning import (
     WANTED_DEG,
     WANTED_GAIN,
@@ -27,7 +28,6 @@ from thermoctl.identify.tuning import (
     plant_at,
 )
 from thermoctl.rig.signals import AT
-from thermoctl.yamlfile import InputError
 
 # Share of the ticks that may be skipped, late by more than half a period, or lost. At 1 % the mean dead time
 # grows by a hundredth of a period; at 9 % a loop was proposed that diverged in 0.16 s.

@@ -38,8 +38,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, optimize, signal
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.statespace import StateSpace, modal
-from thermoctl.yamlfile import InputError
 
 MOMENTS = 3
 

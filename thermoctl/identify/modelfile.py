@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermoctl import safe_file
 from thermoctl.control.model import UNITS, CompensatorModel
-from thermoctl.yamlfile import InputError, Node, load
+from thermoctl.files import safe_file
+from thermoctl.files.yamlfile import InputError, Node, load
 
 FORMAT = "thermoctl-model/1"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")

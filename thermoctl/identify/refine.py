@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg, optimize
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, _c
-from thermoctl.yamlfile import InputError
 
 
 def innovations(model: StateSpace, u: np.ndarray, y: np.ndarray, gain: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import kernels
-from thermoctl.yamlfile import InputError
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 from scipy import optimize, signal
 
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 
 # No gains are proposed when the phase near the crossover has a larger standard error. A smaller one counts as
 # dead time.

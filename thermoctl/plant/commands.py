@@ -11,6 +11,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table as Grid
 
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
@@ -25,8 +27,6 @@ from thermoctl.plant.units import as_recorded
 from thermoctl.recording.files import write_table
 from thermoctl.recording.foreign.logger import options, print_notes
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError
 
 Reader = Callable[[Plant, Sequence[str], argparse.Namespace], list[Table]]
 

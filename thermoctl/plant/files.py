@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.foreign import plant_node
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parse import parse
 from thermoctl.plant.units import check_units
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
 
 
 def load(path: str | Path, mapped: str | Path | None = None) -> Plant:

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.files.yamlfile import Node, suggest
 from thermoctl.plant.language import FORMAT
 from thermoctl.plant.native.fmu import Fmu, Variable, opened
 from thermoctl.plant.parse import RESERVED
 from thermoctl.units import dimension
-from thermoctl.yamlfile import Node, suggest
 
 SECTIONS = ("title", "inputs", "states", "outputs", "parameters")
 EXPRESSIONS = ("storage", "initial", "value")

@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from thermoctl.files.yamlfile import Node as YamlNode
+from thermoctl.files.yamlfile import Section, kind_of, number_of, suggest
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import (
@@ -24,8 +26,6 @@ from thermoctl.plant.language import (
     Plant,
     SensorNoise,
 )
-from thermoctl.yamlfile import Node as YamlNode
-from thermoctl.yamlfile import Section, kind_of, number_of, suggest
 
 MAX_ITEMS = 2_000  # inputs, nodes, ... of one file
 SECTIONS = ("inputs", "parameters", "nodes", "flows", "outputs")

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from rich.table import Table
 
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,13 +15,13 @@ from fractions import Fraction
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Input, Node, Output, Parameter, Plant
 from thermoctl.recording.foreign.units import split_unit
 from thermoctl.recording.table import Table
 from thermoctl.units import Dimension, conversion, described, dimension, raised, times
-from thermoctl.yamlfile import InputError
 
 
 def check_units(plant: Plant) -> None:

@@ -10,11 +10,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import write_table
 from thermoctl.recording.foreign.logger import joined, options, print_notes, read_recording
 from thermoctl.recording.reader import export, info, recover
 from thermoctl.recording.writer import FULL, TIER, recording_files
-from thermoctl.yamlfile import InputError
 
 UNKNOWN_RIG = "unknown rig"
 """Label of old recordings, which do not name their rig."""

@@ -18,10 +18,10 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError, suggest
 
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
 MAX_CSV_BYTES = 4_000_000_000

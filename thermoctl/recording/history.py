@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.stream import open_stream
 from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
 from thermoctl.rig.signals import NAMES
-from thermoctl.yamlfile import InputError, suggest
 
 Invalid = Callable[[Mapping[str, np.ndarray], Mapping[str, str], str], np.ndarray] | None
 FULL_SPAN_S = 60.0  # at and below this the full rate is shown

@@ -15,14 +15,14 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from thermoctl.files.safe_file import whole_file
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.files import READERS, read_table, to_arrow
 from thermoctl.recording.foreign import formats
 from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.stream import END, open_stream
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import of_recording
-from thermoctl.safe_file import whole_file
-from thermoctl.yamlfile import InputError, suggest
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 CRC = b"crc32"

@@ -26,9 +26,9 @@ from typing import Protocol
 import numpy as np
 import pyarrow as pa
 
+from thermoctl.files.safe_file import part_file, reason, sync_folder
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.rig.signals import SIGNALS, Signal
-from thermoctl.safe_file import part_file, reason, sync_folder
 
 BATCH_S = 0.5  # of ticks in one batch of the full rate; a power loss costs at most this
 BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster

@@ -16,8 +16,8 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError, Node, Section, load
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError, Node, Section, load
 
 OK, STALE, ERROR, ABSENT = range(4)
 STATUS_NAMES = ("OK", "STALE", "ERROR", "ABSENT")

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import (
     AMP_DISABLED,
     AMP_ENABLED,

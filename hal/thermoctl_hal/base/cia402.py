@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 
-from thermoctl.yamlfile import Node, integer_of, kind_of
+from thermoctl.files.yamlfile import Node, integer_of, kind_of
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, AMP_QUICK_STOP
 from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.base.profile import FIELD_TYPES, Object

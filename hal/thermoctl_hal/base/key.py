@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from thermoctl.yamlfile import Node, Section, number_of, suggest
+from thermoctl.files.yamlfile import Node, Section, number_of, suggest
 
 REQUIRED: Any = ...
 

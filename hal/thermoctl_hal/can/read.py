@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.cia402 import OBJECT_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import named, sentinel_of, take
 from thermoctl_hal.base.profile import (

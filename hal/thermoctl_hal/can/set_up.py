@@ -15,7 +15,7 @@ import contextlib
 import struct
 import time
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.cia402 import CONTROL_WORD, STANDARD_TYPES
 from thermoctl_hal.base.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name

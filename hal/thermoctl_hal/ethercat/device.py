@@ -17,7 +17,7 @@ import math
 import struct
 
 from thermoctl.extras import load
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.cia402 import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word

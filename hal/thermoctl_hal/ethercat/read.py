@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.cia402 import OBJECT_TYPES, STANDARD_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from thermoctl.yamlfile import Node, Section, number_of
+from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     BIT_KINDS,

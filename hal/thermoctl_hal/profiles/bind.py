@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from thermoctl.files.yamlfile import InputError, Node, Section, suggest
 from thermoctl.rig.channels import DEFAULT, AxesChannels, Channels
-from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.base.binding import Binding, Bound, limits_of, port_key
 from thermoctl_hal.base.profile import BinaryFrame, Cia402, Dbc, Modbus, Profile, Register, TextLine
 from thermoctl_hal.base.units import role_units

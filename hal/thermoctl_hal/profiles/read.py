@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from thermoctl import yamlfile
-from thermoctl.yamlfile import Section
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import Section
 from thermoctl_hal.base.key import take
 from thermoctl_hal.base.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
 from thermoctl_hal.base.text_file import while_same

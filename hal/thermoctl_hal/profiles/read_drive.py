@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from thermoctl.yamlfile import Node, Section, integer_of, number_of
+from thermoctl.files.yamlfile import Node, Section, integer_of, number_of
 from thermoctl_hal.base.key import named, take
 from thermoctl_hal.base.profile import (
     ACTUAL_POSITION,

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.channels import AT, DEFAULT, AxesChannels, Channels
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import ABSENT, STALE, HardwareError, Sample
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.wire import Ages, wait_readable

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.channels import AxesChannels
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import Backend, HardwareError
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device

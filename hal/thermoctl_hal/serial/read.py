@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from thermoctl.yamlfile import Node, Section, integer_of, suggest
+from thermoctl.files.yamlfile import Node, Section, integer_of, suggest
 from thermoctl_hal.base.checksum import ALIASES, SUMS, algorithm, names
 from thermoctl_hal.base.key import named, take
 from thermoctl_hal.base.profile import (

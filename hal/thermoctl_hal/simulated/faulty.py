@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.files.yamlfile import Node, Section, suggest
 from thermoctl.rig.channels import AT, DEFAULT, Channels
-from thermoctl.yamlfile import Node, Section, suggest
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
 
 KINDS = (

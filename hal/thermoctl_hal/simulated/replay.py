@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.channels import DEFAULT, Channels
-from thermoctl.yamlfile import InputError, suggest
 from thermoctl_hal.base.backend import OK, STALE, Sample
 from thermoctl_hal.base.units import role_units
 

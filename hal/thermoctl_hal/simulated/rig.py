@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.yamlfile import InputError, Node, Section, suggest
 from thermoctl.plant import load
 from thermoctl.plant.language import SensorNoise
 from thermoctl.plant.simulation.sensor import SlowError
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.rig.channels import AT, DEFAULT, Channels
-from thermoctl.yamlfile import InputError, Node, Section, suggest
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, ERROR, OK, STALE, Sample
 
 MAX_CATCH_UP = 1000  # periods in one read; when the clock jumps further (suspend), the plant skips that time

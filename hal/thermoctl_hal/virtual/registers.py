@@ -6,7 +6,7 @@ import contextlib
 import re
 import socket
 
-from thermoctl.yamlfile import InputError, suggest
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.profile import Register, typed
 from thermoctl_hal.virtual.device import PtyDevice, channel_of

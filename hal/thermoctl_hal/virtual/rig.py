@@ -31,8 +31,8 @@ from pathlib import Path
 from typing import TextIO
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.rig.channels import AxesChannels
-from thermoctl.yamlfile import InputError, suggest
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.profiles.bind import bind, check_rig
 from thermoctl_hal.simulated.rig import make_rig

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.binding import Binding, Bound
 from thermoctl_hal.base.profile import (
     ERROR_CODE,

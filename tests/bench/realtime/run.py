@@ -251,8 +251,8 @@ def run_daemon(bench: Bench, seconds: float, ask_hz: float) -> dict[str, Any]:
     from thermoctl.daemon.control_socket import ask
     from thermoctl.daemon.tick.assemble import shared_name
     from thermoctl.daemon.tick.shared import START_S, Shared
+    from thermoctl.files.yamlfile import InputError
     from thermoctl.rig.signals import INDEX
-    from thermoctl.yamlfile import InputError
 
     settings = load_settings(bench.config)
     stamps_path = bench.work / "stamps.bin"

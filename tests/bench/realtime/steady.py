@@ -124,7 +124,7 @@ def daemon(work: Path, minutes: float) -> dict[str, list[Sample]]:
     """A sample of each process every two seconds, from the tenth second on."""
     from thermoctl.configuration.settings import load_settings
     from thermoctl.daemon.control_socket import ask
-    from thermoctl.yamlfile import InputError
+    from thermoctl.files.yamlfile import InputError
 
     config = configuration(work)
     settings = load_settings(config)

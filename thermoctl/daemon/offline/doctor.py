@@ -32,9 +32,9 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.extras import lacking
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.writer import disk_warning
 from thermoctl.rig.channels import AMPLIFIER_STATES
-from thermoctl.yamlfile import InputError
 from thermoctl_hal.base.backend import OK, STATUS_NAMES, Backend, HardwareError, Sample
 from thermoctl_hal.base.latency_timer import latency_timer_ms
 from thermoctl_hal.rig.make import (

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from thermoctl.configuration.settings import AXES, Settings
-from thermoctl.yamlfile import Node, load
+from thermoctl.files.yamlfile import Node, load
 from thermoctl_hal.base.binding import Bound
 from thermoctl_hal.profiles.bind import bind
 

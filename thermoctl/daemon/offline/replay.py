@@ -11,10 +11,10 @@ import numpy as np
 from thermoctl.control.law import Law
 from thermoctl.daemon.recorder import read_law_metadata
 from thermoctl.daemon.tick.ring import unpack_readings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.reader import info, read_rows
 from thermoctl.rig.channels import of_names
 from thermoctl.rig.signals import AT, OUTPUTS, of_channels
-from thermoctl.yamlfile import InputError
 
 _DT, _COMMAND, _VALUE, _EXTERNAL = (AT[n] for n in ("dt_s", "command", "command_value", "external_bits"))
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from thermoctl.configuration.settings import RigSettings, Settings
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
+from thermoctl.files.yamlfile import InputError, load
 from thermoctl.rig.channels import Channels
-from thermoctl.yamlfile import InputError, load
 from thermoctl_hal.profiles.bind import bind
 
 UNNAMED = RigSettings().name

@@ -31,9 +31,9 @@ import numpy as np
 from thermoctl.control import faults
 from thermoctl.control.model import packed_names
 from thermoctl.daemon.tick.ring import Box, Histogram, Mailbox, Remarks, Ring
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.channels import DEFAULT, Channels, of_text
 from thermoctl.rig.signals import Row, of_channels
-from thermoctl.yamlfile import InputError
 
 VERSION = 2
 MAGIC = 0x7468726D6F63746C  # 'thrmoctl'

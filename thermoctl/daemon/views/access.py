@@ -9,7 +9,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 MIN_TOKEN = 16  # characters
 

@@ -47,12 +47,12 @@ from thermoctl.daemon.tick.assemble import rig_identity
 from thermoctl.daemon.views.access import MIN_TOKEN, Policy, Refused, parse_address
 from thermoctl.daemon.views.metrics import CONTENT_TYPE, metrics
 from thermoctl.daemon.views.watch import Watch
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError
 from thermoctl.log import console_log
 from thermoctl.recording.history import history, recorded_span
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.signals import AT
-from thermoctl.shipped import shipped
-from thermoctl.yamlfile import InputError
 
 PAGE = Path(__file__).with_name("dashboard.html")
 MAX_HEAD, MAX_BODY = 8192, 1024  # bytes of a request

@@ -32,9 +32,9 @@ from thermoctl.daemon.service import START_S, STOP_S, Background
 from thermoctl.daemon.views.dashboard import make_server, url
 from thermoctl.daemon.views.monitor import errors, ramp_of, remember, screen
 from thermoctl.daemon.views.watch import Watch
-from thermoctl.safe_file import make_folder, write_text
-from thermoctl.shipped import state_folder
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import make_folder, write_text
+from thermoctl.files.shipped import state_folder
+from thermoctl.files.yamlfile import InputError
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
 """Corners (s in the cycle, setpoint um). 240 um need 0.78 A and 2.9 W: +2 um of shaft in a minute."""

@@ -29,7 +29,7 @@ from thermoctl.daemon.answers.display import (
     span,
 )
 from thermoctl.daemon.control_socket import ask
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 BLOCKS, ASCII = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 FEWEST = 4  # lines of faults that are shown on any terminal: the cause, its remedy and what follows

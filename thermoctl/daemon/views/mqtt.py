@@ -20,7 +20,7 @@ from typing import Any
 from thermoctl.configuration.settings import Settings
 from thermoctl.daemon.control_socket import ask
 from thermoctl.extras import load
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 CONNECT_S = 10.0
 ONLINE, OFFLINE = "online", "offline"

@@ -28,9 +28,9 @@ from thermoctl.daemon.answers.readings import hide_invalid, invalid
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.tick.assemble import compensator, rig_identity, shared_name
 from thermoctl.daemon.tick.shared import Shared
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.history import history, recorded_span
 from thermoctl.rig.signals import AT, fault_words
-from thermoctl.yamlfile import InputError
 
 BEFORE_S, AFTER_S = 2.0, 2.0  # span of a capture before and after the fault
 CAPTURES = 16

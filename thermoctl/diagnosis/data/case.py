@@ -20,6 +20,7 @@ from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back
 from thermoctl.plant.fitting.refit import Fit, fit
@@ -27,7 +28,6 @@ from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 LEAST = 40  # least number of measured values of at least one output
 STATED = 12  # least number if the plant file states the output's noise, so that it is not estimated

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError
 
 FILE = "memory.json"
 FORMAT = "thermoctl-memory/1"

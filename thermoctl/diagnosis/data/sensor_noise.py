@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnosis.data.spectra import spectrum
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, save
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.fitting.whitening import default_noise
@@ -31,7 +32,6 @@ from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 LEAST = 100  # least number of measured values of an output to learn its noise
 DIGITS = 3

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 from thermoctl.units import dimension
-from thermoctl.yamlfile import InputError
 
 TOGETHER = 0.98  # correlation from which two inputs count as one lever, such as voltage and current
 # Dimensions of temperature, sunshine and pressure: these cannot be commanded.

@@ -11,9 +11,9 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.experiment.design import TOGETHER, Excitation
+from thermoctl.files.safe_file import write_text
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import write_text
 
 FORMAT = "thermoctl-experiments/1"
 FILES = ("next_experiment.yaml", "next_experiment.csv")

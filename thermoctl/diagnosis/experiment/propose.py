@@ -32,10 +32,10 @@ from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.law.result import described
 from thermoctl.diagnosis.result import Diagnosis
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Scale
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError
 
 MOST = 5  # largest number of hypotheses that are compared
 LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnosis.experiment.file import FILES
-from thermoctl.safe_file import write_text
+from thermoctl.files.safe_file import write_text
 
 ROUNDS = 3
 

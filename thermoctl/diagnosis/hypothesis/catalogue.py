@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from thermoctl import yamlfile
 from thermoctl.diagnosis.hypothesis.effect import Effect, read
-from thermoctl.shipped import shipped
+from thermoctl.files import yamlfile
+from thermoctl.files.shipped import shipped
 
 CATALOGUE = shipped("config/effects")
 

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl import yamlfile
+from thermoctl.files import yamlfile
+from thermoctl.files.yamlfile import Node, Section, suggest
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.units import dimension
-from thermoctl.yamlfile import Node, Section, suggest
 
 SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "node": ("n",),

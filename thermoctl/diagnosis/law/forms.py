@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl import yamlfile
 from thermoctl.diagnosis.hypothesis.effect import Effect, EffectParameter
 from thermoctl.diagnosis.law.memory import MEMORIES
 from thermoctl.diagnosis.law.signals import Place, Signal, Values
+from thermoctl.files import yamlfile
+from thermoctl.files.shipped import shipped
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
-from thermoctl.shipped import shipped
 
 LAW = "law"  # name of a law among the effects of a hypothesis
 

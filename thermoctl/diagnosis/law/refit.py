@@ -17,9 +17,9 @@ from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.law.forms import law_effect, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
-from thermoctl.yamlfile import InputError
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
 SIMPLER = 6  # number of further refits, of sums without their least significant term

@@ -17,12 +17,12 @@ from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import equation, law_rate
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
 from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.files.safe_file import make_folder, write_text
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
 from thermoctl.report.page import BLUE, FAINT, GREY, figure, sheet, table, unit
-from thermoctl.safe_file import make_folder, write_text
-from thermoctl.yamlfile import InputError
 
 EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 

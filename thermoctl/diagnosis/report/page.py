@@ -20,11 +20,11 @@ from thermoctl.diagnosis.report.figures import Output, Rows, chance, outputs
 from thermoctl.diagnosis.report.plots import BROAD, NARROW, compared, remaining
 from thermoctl.diagnosis.report.words import listed, name, sentences, what_next
 from thermoctl.diagnosis.result import Diagnosis, curves
+from thermoctl.files.safe_file import write_text
 from thermoctl.plant.fitting.estimate import Estimate, correlations, report
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.show import drawing
 from thermoctl.report.page import figure, folded, page, sheet, table, unit
-from thermoctl.safe_file import write_text
 
 SHOWN = 4  # largest number of further curves, those with the largest errors
 # Least change of a parameter by a finding that is reported: in standard deviations, and relative.

@@ -21,8 +21,8 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
 from thermoctl.diagnosis.evidence.posterior import Placed, Posterior
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.dates import begun, line
-from thermoctl.yamlfile import InputError
 
 
 def trends(

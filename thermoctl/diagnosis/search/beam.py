@@ -24,12 +24,12 @@ from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.screen import Norms, sharpened
 from thermoctl.diagnosis.search.screening import Screened, places, screened
 from thermoctl.diagnosis.search.shortlist import HALF, PAIR, shortlist, simpler
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import LEAST, batches, each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
-from thermoctl.yamlfile import InputError
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"

@@ -18,11 +18,11 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.files.shipped import shipped
 from thermoctl.plant.fitting.cores import LEAST, each
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
-from thermoctl.shipped import shipped
 
 MISTAKES = shipped("config/mistakes")
 # Range of the constant, over the difference between the first sample and the plant's initial value.

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.table import Table
 from thermoctl.units import conversion, dimension
-from thermoctl.yamlfile import InputError
 
 UNITS = {
     "temperature": "degC",

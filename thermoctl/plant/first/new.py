@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from thermoctl.files.safe_file import write_text
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.files import loads
 from thermoctl.plant.first import motion, tanks, template, thermal
 from thermoctl.plant.first.columns import COLDEST, HOTTEST, Column, quoted, recognise
@@ -13,8 +15,6 @@ from thermoctl.plant.first.template import TEMPLATES
 from thermoctl.recording.foreign.logger import options, print_notes, read_recording
 from thermoctl.recording.foreign.units import split_unit
 from thermoctl.recording.table import Table
-from thermoctl.safe_file import write_text
-from thermoctl.yamlfile import InputError, suggest
 
 HEATING = ("power", "current", "voltage", "duty")
 DRIVING = ("force", "torque", "current", "voltage", "duty", "power")

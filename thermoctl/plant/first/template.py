@@ -6,14 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import permutations
 
+from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.files import loads
 from thermoctl.plant.first.columns import UNITS, Column, quoted, words
 from thermoctl.plant.first.thermal import confirm
 from thermoctl.plant.language import Input, Output, Plant
 from thermoctl.recording.table import Table
-from thermoctl.shipped import shipped
 from thermoctl.units import dimension
-from thermoctl.yamlfile import InputError, suggest
 
 TEMPLATES = ("block", "motor", "hot-end", "room", "tank", "stage", "flexure", "actuator")
 # Words for the same place in several languages, one place a line.

@@ -20,12 +20,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import each, workers
 from thermoctl.plant.fitting.whitening import Noise, Whitening
 from thermoctl.plant.language import Parameter
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
-from thermoctl.yamlfile import InputError
 
 HUGE = 1e100  # outputs from here on count as infinite: the sums of their squares would be
 HUBER = 4.0  # residuals beyond this many standard deviations count linearly

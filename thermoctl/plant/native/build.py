@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from thermoctl.safe_file import move
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import move
+from thermoctl.files.yamlfile import InputError
 
 
 @cache

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.native.build import compiler, library
-from thermoctl.yamlfile import InputError, suggest
 
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ModelVariable

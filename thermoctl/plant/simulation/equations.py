@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import ZERO, Expr, add, derivative, div, name, neg
 from thermoctl.plant.language import Plant
 from thermoctl.plant.native.fmu import opened, used
-from thermoctl.yamlfile import InputError
 
 _JUMPS = ("step", "sign", ">", ">=", "<", "<=", "bump")
 _NONE: Mapping[str, str] = {}

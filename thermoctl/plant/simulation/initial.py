@@ -7,12 +7,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.ahead import ahead, all_uncertain
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError, suggest
 
 BLOCKS = 50  # of a recording whose last state is estimated
 SETTLED = 1e-6  # largest change of a steady state, as a share of its size, over half a run

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
@@ -18,7 +19,6 @@ from thermoctl.plant.simulation.compile import Code, machine_code
 from thermoctl.plant.simulation.sensor import error
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError, suggest
 
 RTOL = 1e-7  # local error a step, as a share of each state's range
 JUMP_WIDTH = 1e-5  # half width of a smoothed jump, as a share of the range of its argument

@@ -14,12 +14,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.axis import is_generic, named
 from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
 from thermoctl.units import SECONDS
-from thermoctl.yamlfile import InputError
 
 SAMPLE = 400  # lines that decide
 FEW = 5  # lines; of more, a head takes at most half

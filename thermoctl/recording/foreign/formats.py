@@ -20,12 +20,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.clock import Seconds
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import units
-from thermoctl.yamlfile import InputError, suggest
 
 
 def _damaged(path: Path, kind: str, e: Exception) -> InputError:

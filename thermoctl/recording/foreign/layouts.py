@@ -15,11 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
 from thermoctl.recording.foreign.sheet import Sheet
 from thermoctl.recording.foreign.units import WORDS, spelled
-from thermoctl.yamlfile import InputError
 
 IDS = WORDS["identities"].split()
 VALUES = WORDS["values"].split()

@@ -25,6 +25,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
 from thermoctl.recording.foreign import axis, cells, clock, formats, layouts
 from thermoctl.recording.foreign.axis import Clock
@@ -43,7 +44,6 @@ from thermoctl.recording.foreign.dialect import (
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import split_unit, split_words
 from thermoctl.recording.table import Table
-from thermoctl.yamlfile import InputError, suggest
 
 HEAD = 65536  # bytes that decide whether a file is one of ours
 HOUR_S = 3600.0

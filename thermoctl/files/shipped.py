@@ -11,10 +11,10 @@ import site
 import sys
 from pathlib import Path
 
-from thermoctl.safe_file import whole_files
-from thermoctl.yamlfile import InputError
+from thermoctl.files.safe_file import whole_files
+from thermoctl.files.yamlfile import InputError
 
-_CHECKOUT = Path(__file__).resolve().parents[1]
+_CHECKOUT = Path(__file__).resolve().parents[2]
 _INSTALLED = [Path(base) / "share/thermoctl" for base in (sys.prefix, site.getuserbase())]
 COPIED = {"config": "config", "docs/examples": "examples"}
 """Folders that `thermoctl init` copies, and their names there."""

@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from thermoctl.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError
 
 SUFFIX = ".part"
 STALE_S = 60.0  # a younger temporary file may belong to a program that has not locked it yet
