@@ -23,7 +23,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.reader import export, info
 from thermoctl.recording.writer import FULL, recording_files
 
-LOG_BYTES = 1_000_000  # from the log's end
+LOG_BYTES = 1_000_000  # size of the part of the log that is kept, its end
 HIDDEN = "(left out)"
 _SECRET = re.compile(r"(?i)((?:password|passwd|token|secret|api_?key)\w*[\"']?\s*[:=]\s*|bearer\s+)[^\s,}]+")
 _ADDRESS = re.compile(r"(://[^\s:/@]*:)[^\s@]+(?=@)")

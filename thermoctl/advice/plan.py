@@ -36,8 +36,8 @@ from thermoctl.recording.table import Table
 
 REST = {"degC": 20.0, "K": 293.15, "degF": 68.0}  # surroundings where nothing states them
 SETTLED = 3.0  # time constants after which a step has come to 95 %
-LEVELS = 7  # of the course that is planned without a recording
-ROWS = 2000  # of that experiment
+LEVELS = 7  # number of levels of the course that is planned without a recording
+ROWS = 2000  # number of rows of that experiment
 ALONE = 1e-6  # share of a range's precision that is left where the readings alone are asked
 
 

@@ -171,7 +171,7 @@ def calibrate(
     Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
     calibrated, HardwareError for one that refuses.
     """
-    load("matplotlib", "calibrate")  # for its report: lacking, it ends before any test
+    load("matplotlib", "calibrate")  # the report needs it: if it is missing, end before any test
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)

@@ -34,12 +34,12 @@ from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import driving_devices
 
-POLL_S = 0.01  # between two polls of the rig and of the keyboard
+POLL_S = 0.01  # time between two polls of the rig and of the keyboard
 # after this time without a tick the loop has ended (the supervisor's STALL_S; at least protection.late_s)
 STALL_S = 1.0
 RESTART_S = 5.0  # time for the supervisor to restart a command process that ended
-REST_K, REST_S = 0.5, 600.0  # at rest: all points within REST_K, or none moved by more in REST_S
-REPORT_S = 60.0  # between two reports while the rig cools
+REST_K, REST_S = 0.5, 600.0  # the rig is at rest if all points are within REST_K, or moved less in REST_S
+REPORT_S = 60.0  # time between two reports while the rig cools
 GAP_S = 2.0  # a longer gap in the daemon's own recording makes a test start again
 
 

@@ -25,7 +25,7 @@ from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
 
-EVERY_S = 0.1  # between the rows that are kept
+EVERY_S = 0.1  # time between the rows that are kept
 READY_S = 20.0  # longest simulated time until the law is READY
 ANY_INNOVATION_C = 1e3  # unreachable limit: without a model there is nothing to compare the coil with
 

@@ -215,7 +215,7 @@ def proof(settings: Settings, recordings: Mapping[str, Path], order: int, acting
     t = read_table(recordings["test_4b"])
     c = t.columns
     growth = c["output_reference_um"] - c["position_raw_um"]
-    origin_um = np.nanmean(growth[:SETTLED])  # of the two encoders; the output may move at the start
+    origin_um = np.nanmean(growth[:SETTLED])  # difference of the two encoders before the output moves
     growth = growth - origin_um
     if acting:
         left = c["output_reference_um"] - c["reference_um"] - origin_um

@@ -45,7 +45,7 @@ def unit_findings(plant: Plant) -> list[Finding]:
 
 
 def _once(found: list[Finding]) -> list[Finding]:
-    """Return one finding a kind and text, of the first recording that shows it."""
+    """Return the findings without repetitions: of those with the same kind and text, the first one."""
     return list({(f.kind, f.what): f for f in reversed(found)}.values())[::-1]
 
 

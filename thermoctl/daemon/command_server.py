@@ -62,7 +62,7 @@ class Commands:
         self.can_drive = can_drive(settings)
         if shared.counters[
             TRIAL
-        ]:  # of a command process that was killed; the file still has the gains of before
+        ]:  # gains of a command process that was killed; the file still has the gains before it
             with contextlib.suppress(InputError):
                 self.settings = reload_settings(settings, settings)[0]
             with contextlib.suppress(InputError):  # the loop is not there: the next arming tries again

@@ -63,7 +63,7 @@ def save(path: Path, model: CompensatorModel, state: np.ndarray) -> Path:
             "state": encode(state),
         }
     )
-    write_text(path, text, sync=False)  # after a power cut, another boot, it is not used
+    write_text(path, text, sync=False)  # not used after a power cut: it is of another boot
     return path
 
 

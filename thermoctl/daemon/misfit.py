@@ -48,7 +48,7 @@ class Misfit:
 
     def restart(self) -> None:
         """Reset the sums: after a change of the model, or when the clock starts again."""
-        self._rows = np.empty((3, 0))  # of the block that is not complete: t, innovation, gain
+        self._rows = np.empty((3, 0))  # t, innovation and gain of the rows of the incomplete block
         self._last_t, self._last_c = -math.inf, math.nan
         self.sums = [0.0, 0.0]
         # since each sum was zero: start time, total, number of blocks
@@ -103,7 +103,7 @@ class Misfit:
             self._blocks[side] += 1
             if self.sums[side] > LIMIT:
                 found = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
-                # so that the sum soon falls below the limit when the model fits again
+                # the sum stops at the limit, so that it soon falls below it when the model fits again
                 self.sums[side] = LIMIT
         new = found is not None and not self.alarmed
         if found is not None:

@@ -27,7 +27,8 @@ from thermoctl.daemon.unsaved import Unsaved
 from thermoctl.rig.signals import AT
 
 INTERVAL_S = 0.1
-LAW_VERSION = 4  # of the law's inputs, state and arithmetic: a replay is bit for bit only within one
+# Version of the law's inputs, state and arithmetic: a replay is bit for bit only within one version.
+LAW_VERSION = 4
 _TICK, _GENERATION = AT["tick"], AT["generation"]
 
 

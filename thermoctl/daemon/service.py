@@ -135,7 +135,7 @@ def stop(settings: Settings) -> int:
     for part in settings.parts:
         with contextlib.suppress(
             InputError
-        ):  # a process that does not answer is ended all the same; its end disables the amplifier
+        ):  # a process that does not answer is ended, too; the amplifier is disabled when it ends
             ask(part.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:
@@ -145,7 +145,7 @@ def stop(settings: Settings) -> int:
         try:
             os.kill(pid, signal.SIGTERM)
         except ProcessLookupError:
-            pass  # it is already ending
+            pass  # the process is already ending
         except PermissionError:
             print(f"thermoctl: pid {pid} is another user's: stop it as that user or root", file=sys.stderr)
             return 3

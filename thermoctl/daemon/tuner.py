@@ -83,7 +83,7 @@ class Tuning:
 
     def _sample(self, rows: np.ndarray) -> None:
         skipped, made = (float(rows[-1, k] - rows[0, k]) for k in (_SLIPS, _TICK))
-        is_test = skipped <= SLIPS * (made + skipped)  # one whose ticks were skipped is none
+        is_test = skipped <= SLIPS * (made + skipped)  # with more skipped ticks the test is not valid
         good = is_test & ~self.row.states(rows)[:, _BOTH].any(axis=1)
         error = (
             float(np.mean((rows[:, _REFERENCE] - rows[:, _POSITION])[good])) if good.any() else float("nan")

@@ -14,12 +14,13 @@ import numpy as np
 
 from thermoctl.daemon.tick.shared import UNSAVED, Shared
 
-ATTEMPTS = 3  # to read a text while it is being written
+ATTEMPTS = 3  # number of attempts to read a text that may be written meanwhile
 _EVENTS = {
     "recording": ("nothing is recorded", "recording again"),
     "estimates": ("the estimates are not kept: the next start is cold", "the estimates are kept again"),
 }
-LONGEST = 400  # characters of a reason; its end names the error
+# Largest number of characters of a reason; of a longer one the end is kept, which names the error.
+LONGEST = 400
 REMEDY = "free some space or mend the disk; it is tried again by itself"
 
 

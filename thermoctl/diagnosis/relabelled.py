@@ -31,7 +31,9 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 
-GAINS = (0.3, 1.5)  # of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for degC
+# Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
+# degC.
+GAINS = (0.3, 1.5)
 HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all of it
 GAIN, SIZE = "sensor_gain", "A"
 

@@ -30,7 +30,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Fast(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """The same by libyaml, five times as fast; its messages are others, so _Loader reads what it refuses."""
+    """The loader of libyaml, five times as fast. _Loader reads a file that it refuses, for its message."""
 
 
 class _Dumper(yaml.SafeDumper):

@@ -116,7 +116,7 @@ def run_all(
         }
         for count, future in enumerate(distributed.as_completed(list(futures)), 1):
             job = futures[future]
-            if future.status == "error":  # its workers died RETRIES times
+            if future.status == "error":  # RETRIES workers died with this job
                 run = _run(job, f"{type(future.exception()).__name__}: {future.exception()}", None)
                 write_text(make_folder(out / job.name) / "run.json", json.dumps(run) + "\n")
             else:

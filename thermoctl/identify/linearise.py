@@ -77,7 +77,7 @@ def thermal(plant: Plant, at_c: float = 25.0, channels: Channels = DEFAULT) -> T
     Columns of its inputs and outputs must be the program's signals (air_c, voltage_v and current_a or
     power_w, the points' POINT_c, position_error_um). Raises InputError."""
     inputs, outputs, powered = _signals(plant, channels.temperatures)
-    nodes = list(plant.nodes)  # those that are states; the others keep their start
+    nodes = list(plant.nodes)  # nodes that are states; the others keep their initial value
     point: dict[str, float] = (
         {p.name: p.value for p in plant.parameters.values()}
         | {i: 0.0 for i in plant.inputs}

@@ -102,7 +102,8 @@ class Measured:
     def is_sure(self) -> bool:
         """Whether both margins are known well enough, or surely above the wanted ones."""
         phase = self.phase_deg - 2.0 * self.phase_error_deg >= WANTED_DEG or self.phase_error_deg <= SURE_DEG
-        error = 0.0 if math.isinf(self.gain) else self.gain_error / self.gain  # of the loop's size, too
+        # The relative error of the loop's gain, too.
+        error = 0.0 if math.isinf(self.gain) else self.gain_error / self.gain
         gain = self.gain / (1.0 + 2.0 * error) >= WANTED_GAIN or error <= SURE_GAIN
         return phase and gain
 

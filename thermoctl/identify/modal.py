@@ -178,7 +178,7 @@ class _Fit:
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Q of F, the residue matrix and the residual.
 
-    `ridge` of each column's norm keeps nearly equal poles harmless.
+    A ridge of `ridge` times each column's norm keeps nearly equal poles harmless.
     """
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)

@@ -91,7 +91,7 @@ class StateSpace:
         The subtraction from 1 would lose digits.
         """
         if self.poles.real.min() <= 0:
-            self.resample(period_s)  # for its error, which names the pole
+            self.resample(period_s)  # raises an error that names the pole
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)
         total = term = f
         for k in range(2, 30):

@@ -27,7 +27,7 @@ ROLES = (
     "time_of_day",
 )
 """Kinds of quantities, for units that fit several kinds."""
-FLICKER_DECADES = 4  # of a 1/f part: 20 000 samples reach from 1 / length to half the sampling rate
+FLICKER_DECADES = 4  # range of a 1/f part: 20 000 samples reach from 1 / length to half the sampling rate
 
 
 def _place() -> Any:

@@ -184,7 +184,7 @@ _STYLE = {  # edge, face, font size, word of the legend
 }
 _MARKED = "#b3261e"
 _LINES = {"flow": ("#7d8894", "-"), "read": ("#1a7f37", ":"), "uses": ("#9a86b8", "--")}
-_PAD = {True: 0.35, False: 0.2}  # of a node's box, and of another one, in letters
+_PAD = {True: 0.35, False: 0.2}  # padding in letters of a node's box (True) and of any other box
 
 
 def _size(text: Text, canvas: FigureCanvasAgg, inch: float) -> np.ndarray:

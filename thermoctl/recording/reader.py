@@ -189,7 +189,7 @@ def _table(path: Path, want: list[str] | None) -> Table:
 def _export_stream(
     path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
 ) -> int:
-    if want is not None:  # its error lists the columns
+    if want is not None:  # an unknown name raises an error that lists the columns
         read_names = open_stream(path).schema.names
         for name in want:
             if name not in read_names:

@@ -30,7 +30,7 @@ from thermoctl.files.safe_file import part_file, reason, sync_folder
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.rig.signals import SIGNALS, Signal
 
-BATCH_S = 0.5  # of ticks in one batch of the full rate; a power loss costs at most this
+BATCH_S = 0.5  # duration of one batch at the full rate: a power loss costs at most these ticks
 BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster
 TIER_HZ = 10.0
 TIER_BATCH_ROWS = 100  # 10 s; after a power loss the full rate still has these rows

@@ -31,7 +31,7 @@ _VARIABLES = {
 _STYLE = Path(__file__).with_name("style.css")
 _NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·–]*$")
 _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
-_TEXT: Any = {  # of figures: one size of letters, no frame
+_TEXT: Any = {  # style of figures: one size of letters, no frame
     "font.size": 9,
     **dict.fromkeys(
         ("axes.titlesize", "axes.labelsize", "legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 9

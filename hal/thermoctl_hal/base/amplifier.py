@@ -30,8 +30,8 @@ from thermoctl_hal.base.backend import (
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.profile import Amplifier, Assumed, Message
 
-REPEAT_S = 0.1  # between repetitions of enabling and disabling messages
-RESET_S = 1.0  # between attempts to reset a fault
+REPEAT_S = 0.1  # time between repetitions of enabling and disabling messages
+RESET_S = 1.0  # time between attempts to reset a fault
 CONFIRM_S = 0.5  # longest time for the amplifier to report that it is off
 
 

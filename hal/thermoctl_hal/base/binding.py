@@ -47,7 +47,7 @@ class Binding:
     bounds: tuple[Bound, ...]
     place: str
     channels: Channels = DEFAULT
-    shared: bool = False  # other devices of this rig are on the same port
+    shared: bool = False  # are other devices of this rig on the same port?
     neighbours: tuple[Binding, ...] = ()  # the other devices of the port
     axis: str = ""  # whose amplifier it is; empty on a rig without axes, and for devices of several axes
 

@@ -46,7 +46,7 @@ FRAME_TYPES: dict[str, tuple[str, int]] = {
     **{f"skip{n}": ("skip", n) for n in range(1, 65)},
 }
 """Types of fields of a binary frame: kind and bytes."""
-WORD_BYTES = 2  # of a Modbus register
+WORD_BYTES = 2  # size of a Modbus register
 NULL_ADDRESS = 0xFE  # source address of J1939 that no sender has
 
 

@@ -36,7 +36,7 @@ from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import EXTENDED, CanPort, SlcanLine
 
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
-READ_S = 0.1  # between looks of a reading thread at its end
+READ_S = 0.1  # longest wait of a reading thread before it checks whether it has to end
 MAX_REFUSED = 100  # the bus counts as lost after so many refused frames in a row
 _SLCAN_BITRATES = {
     10_000: 0,

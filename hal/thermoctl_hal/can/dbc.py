@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Message as DbcMessage
 
 _Entry = tuple["DbcMessage", list[tuple[int, DbcSource]], list[str]]
-CLASSIC_BYTES = 8  # of a frame that is not CAN FD
+CLASSIC_BYTES = 8  # longest data of a frame that is not CAN FD
 
 
 class DbcDevice(Device):

@@ -82,7 +82,7 @@ def load_dbc(path: Path) -> DbcFile:
     from cantools.database import load_string
 
     text = read_text(path)
-    logging.getLogger("cantools").setLevel(logging.ERROR)  # it warns of names that are defined twice
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # cantools warns of names that are defined twice
     try:
         database: Any = load_string(text, database_format="dbc")
         reason = ""
@@ -220,7 +220,7 @@ def _message(
         return _parsed(block, number, safe_name, chosen, attributes)
 
     message, why = parsed(*signals)
-    if message is None:  # for one of its signals: leave out each that does not stand alone
+    if message is None:  # a signal is wrong: leave out each one that cannot be read alone
         for signal in list(signals):
             alone, fault = parsed(signal)
             if alone is None:
@@ -272,7 +272,7 @@ def _scale(text: str) -> str:
     parts = [p.strip() for p in re.split(r"[,;]", text)]
     if len(parts) == 4:  # a decimal comma in both numbers
         parts = [f"{parts[0]}.{parts[1]}", f"{parts[2]}.{parts[3]}"]
-    elif len(parts) == 3 and not parts[0].strip("+-0"):  # in the factor, which is not 0
+    elif len(parts) == 3 and not parts[0].strip("+-0"):  # a decimal comma in the factor: it is not 0
         parts = [f"{parts[0]}.{parts[1]}", parts[2]]
     if len(parts) != 2 or not all(_NUMBER.fullmatch(p) for p in parts):
         return ""

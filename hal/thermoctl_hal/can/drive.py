@@ -149,9 +149,10 @@ class Cia402Device(Device):
     def _take_heartbeat(self, port: AnyPort, state: int, now_s: float) -> None:
         """Take a heartbeat with the NMT state of the drive. Raises HardwareError when the drive restarted."""
         if state == 0:  # boot-up
-            raise HardwareError("the drive restarted")  # its PDO mapping and watchdog are gone
+            # The drive has lost its PDO mapping and watchdog settings.
+            raise HardwareError("the drive restarted")
         self._heard_s = now_s
-        if state == _PRE_OPERATIONAL:  # it left operation when our heartbeat was missing
+        if state == _PRE_OPERATIONAL:  # the drive left `operational` because our heartbeat was missing
             port.send((NMT_ID, bytes((NMT_START, self._node))))
 
     def _store(self, sample: Sample, data: int, now_s: float) -> None:

@@ -28,7 +28,7 @@ from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.ethercat.slave import SlaveSetUp
 
 LOST_FRAMES = 3  # frames in a row without an answer, after which the link counts as lost
-CHECK_S = 0.05  # between two looks at the states of the slaves
+CHECK_S = 0.05  # time between two checks of the slaves' states
 UP_S = 2.0  # longest time for a slave to reach a state
 INIT, PREOP, SAFEOP, OP, ERROR = 1, 2, 4, 8, 16
 NAMES = {0: "gone", INIT: "INIT", PREOP: "PREOP", 3: "BOOT", SAFEOP: "SAFEOP", OP: "OP"}
@@ -245,7 +245,8 @@ class EthercatBus:
         self._master.read_state()
         if slave.state & 0x0F in (SAFEOP, OP):
             if slave.state & ERROR:
-                self._request(position, SAFEOP | ERROR)  # this bit of a request acknowledges
+                # The ERROR bit in a request acknowledges the slave's error.
+                self._request(position, SAFEOP | ERROR)
         else:
             self._coe(slave.reconfig)
         if slave.state != OP:

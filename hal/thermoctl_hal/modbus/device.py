@@ -57,7 +57,7 @@ ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 ILLEGAL_FUNCTION = 1
 NOT_OF_A_REGISTER = (ILLEGAL_FUNCTION, *PASSING)
 """Exceptions that no register can cause; after any other the block is read one by one."""
-MAX_EXPONENT = 10  # of a scale register: SunSpec allows -10 .. 10, and -32768 for none
+MAX_EXPONENT = 10  # largest value of a scale register: SunSpec allows -10 .. 10, and -32768 for none
 MUTE_POLLS = 2  # lost answers, after which a block that never came is asked for without its gaps
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
 LOST_POLLS = 3  # polls without any answer, after which the link is opened again
@@ -136,7 +136,7 @@ class ModbusDevice(Device):
         self._items += [(i, s.exponent, None) for i, s in sources if s.exponent is not None]
         self._factors: dict[int, float] = {}  # bound channel -> the factor that its scale register gave
         self._state: dict[int, str] = {}  # bound channel with a status: its fault, '' when good
-        self._got: list[tuple[int, float, float]] = []  # of this poll: item, raw number, time
+        self._got: list[tuple[int, float, float]] = []  # readings of this poll: (item, raw number, time)
         self._plan()
         self._lost_polls = 0
         self._heard: set[tuple[str, int, int]] = set()  # kind, address and count of the blocks that came
@@ -190,7 +190,8 @@ class ModbusDevice(Device):
                     self._lost_polls >= MUTE_POLLS
                     and (block.kind, block.address, block.count) not in self._heard
                 ):
-                    again = plan_blocks(block.members, 0, self._spec.max_block)  # it may be mute at gaps
+                    # The device may not answer if a block has gaps.
+                    again = plan_blocks(block.members, 0, self._spec.max_block)
                 self._blocks = (
                     self._blocks[at + 1 :] + self._blocks[:at] + again
                 )  # the next poll starts after it
@@ -231,7 +232,7 @@ class ModbusDevice(Device):
         bad = {i for b in refused for i, _ in b.members}
         good = plan_blocks((m for m in block.members if m[0] not in bad), 0, self._spec.max_block)
         if not good:
-            return  # it is not for one of the registers
+            return  # the answer is not to one of the registers' requests
         at = self._blocks.index(block)
         self._blocks[at : at + 1] = [*good, *refused]
 

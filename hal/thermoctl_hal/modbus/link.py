@@ -44,7 +44,7 @@ SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
 GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
 CHUNK = 4096
-ATTEMPTS = 3  # of one request, where the server closes the connection
+ATTEMPTS = 3  # largest number of times that a request is sent, if the server closes the connection
 _HOST = r"(\[[^]]+\]|[^:/]+):(\d+)/?"
 _PORT = re.compile(rf"(?:tcp:|(?P<rtu>rtu:{NETWORK})){_HOST}")
 
@@ -79,7 +79,7 @@ class Link:
         self.port, self.line, self.users, self.broken = port, line, 0, False
         self._lock = threading.Lock()
         self._transaction = 0
-        self._echoes = False  # this line sends our own bytes back
+        self._echoes = False  # does the line send our own bytes back?
         self._answered = False
         self._free_s = 0.0  # an RTU frame may begin from then on
         self._is_rtu = port.startswith("rtu:")
@@ -163,7 +163,7 @@ class Link:
                 raise HardwareError(f"{self.port}: the connection is gone")
             try:
                 answer = self._ask_again(message, timeout_s)
-            except HardwareError:  # it could not be connected again
+            except HardwareError:  # no new connection could be made
                 self.broken = True
                 raise
             except OSError as e:

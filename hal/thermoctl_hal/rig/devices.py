@@ -42,7 +42,8 @@ class DevicesBackend:
         self.required = {self.roles[r] for r in required} if required is not None else set(range(count))
         self.sample = Sample(count)
         self._owner = {role: d for d in [*fast, *slow] for role in d.roles}
-        self._pacing = self._owner.get(AT["position_um"])  # its frames start the ticks with loop.pace: device
+        # With loop.pace: device, the frames of this device start the ticks.
+        self._pacing = self._owner.get(AT["position_um"])
         self._slow_drives = [d for d in slow if d.drives]
         self._seen = dict.fromkeys(slow, 0)
         limit_s = np.full(count, np.inf)  # age at which a reading is stale

@@ -15,7 +15,7 @@ from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import Assumed
 from thermoctl_hal.rig.board import Board
 
-RECONNECT_S = 0.25  # between attempts to open a device that is gone
+RECONNECT_S = 0.25  # time between attempts to open a device that is gone
 COMMAND_AGE_S = 0.25  # an amplifier is disabled when the loop's last command is older
 
 

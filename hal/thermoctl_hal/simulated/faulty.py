@@ -119,7 +119,8 @@ class FaultInjector:
         self._random = np.random.default_rng(seed)
         self._start_s = math.nan
         self._t = 0.0
-        self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()  # before this read
+        # The sample before this read.
+        self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()
         self._held: dict[tuple[int, int], float] = {}  # (fault, role) -> frozen value
         self._late: dict[tuple[int, int], deque[tuple[float, float]]] = {}
         self._apply = {

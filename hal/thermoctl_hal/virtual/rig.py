@@ -45,7 +45,7 @@ from thermoctl_hal.virtual.text_meter import TextMeter
 
 MAX_STEPS = 50  # most periods simulated at once; after a longer stop the plant skips the rest
 REFERENCE_HZ = 100
-PRIORITY = 70  # below the daemon's loop
+PRIORITY = 70  # real-time priority, below that of the daemon's loop
 OWN = ("amplifier_state", "amplifier_fault", "supply_v")  # roles that need no output of the plant
 TAKES = {"open": "CHANNEL", "close": "CHANNEL", "exception": "CODE", "fault": "CODE", "stop": "MS"}
 """Argument of a device's command; `on/off` of the others."""

@@ -16,10 +16,11 @@ from thermoctl.daemon.tick.shared import COUNTER_WORDS, Shared
 from thermoctl.rig.signals import AT
 
 SLOW_SHARE = (
-    0.5  # of rate_hz: a lower rate is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3
+    # A rate below this share of rate_hz is reported; a busy machine reaches 0.8, a wrong setting 0.1 to 0.3.
+    0.5
 )
 LOOK_ROWS = 4000  # newest ticks in which `status` counts readings
-ATTEMPTS = 3  # to read the counters while the loop writes them, once a second
+ATTEMPTS = 3  # number of attempts to read the counters, which the loop writes once a second
 FEWEST = 10  # no rate is reported where fewer readings are expected in the ticks counted
 
 

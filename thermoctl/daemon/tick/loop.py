@@ -133,7 +133,8 @@ class Axis:
                 self._delay[c] = 0 if age < 0.0 else _LATEST if age >= _LATEST else int(age)
         self.command, self.value, self.external = 0, 0.0, self.write_failed
         for other in self.guards:
-            if other.trips_others() and self.law.state != _FAULT:  # in FAULT both would wait for each other
+            # Two axes in FAULT must not wait for each other.
+            if other.trips_others() and self.law.state != _FAULT:
                 self.external |= _OTHER_AXIS
         if self.mailbox is not None and self.mailbox.waiting():
             command = self.mailbox.take()

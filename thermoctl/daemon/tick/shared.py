@@ -40,11 +40,11 @@ MAGIC = 0x7468726D6F63746C  # 'thrmoctl'
 ROWS = 8192  # ticks a reader may lag behind
 BINS = 4096  # us
 STATE_NUMBERS = 4096
-TEXT_WORDS = 40  # of 8 bytes each, for a device's message
-COUNTER_WORDS = 512  # of 8 bytes each, for the counters of all devices as text
+TEXT_WORDS = 40  # words of 8 bytes for a device's message
+COUNTER_WORDS = 512  # words of 8 bytes for the counters of all devices as text
 UNSAVED = ("recording", "estimates")
 """The writers of the daemon: the places of `Shared.unsaved`."""
-UNSAVED_WORDS = 128  # of 8 bytes each, for the reason
+UNSAVED_WORDS = 128  # words of 8 bytes for the reason
 SHARED_MEMORY = Path("/dev/shm")
 
 DECLARATION_BYTES = 16384

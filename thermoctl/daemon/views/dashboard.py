@@ -234,7 +234,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             self._head(HTTPStatus.OK, "text/event-stream", None)
             watch, seen, told = self.server.watch, -1, -math.inf
-            watch.wait(0, FIRST_LOOK_S)  # it reads the last recorded minute where no daemon runs
+            watch.wait(0, FIRST_LOOK_S)  # without a daemon, the watcher reads the last recorded minute
             self.wfile.write(f"event: past\ndata: {_dump(list(watch.past))}\n\n".encode())
             while not watch.stopping:
                 seen, frame = watch.wait(seen, 1.0)

@@ -184,7 +184,8 @@ class Watch:
             except InputError:
                 return None
             self.shared, self._inode = shared, inode
-            self._position, self._bits = 0, None  # from the oldest row that the ring still holds
+            # Position 0: start with the oldest row that the ring still holds.
+            self._position, self._bits = 0, None
             self._recent.clear()
             self.past.clear()
         return self.shared

@@ -110,7 +110,7 @@ class Case:
     block: int = 1  # number of recorded rows whose mean is one row here
     off: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
-    memory: Memory = NOTHING  # of earlier recordings
+    memory: Memory = NOTHING  # posterior of earlier recordings
     outliers: Outliers = ()
 
     def drives(self, model: Model) -> list[Excitation]:

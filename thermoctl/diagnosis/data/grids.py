@@ -44,7 +44,7 @@ class Grid:
     slow: np.ndarray  # (starts, nodes) likewise, of a noise with slow parts, at each row of STARTS
     known: float  # prior sd of log c^2
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
-    log_rough: float  # its log determinant
+    log_rough: float  # log determinant of `rough`
     log_small: float  # log of the half-normal's mean over the random walk
     sigma: float  # s of noise.py: standard deviation of the stated noise, in the output's unit
     change: float  # w of noise.py: the output's change in a sampling interval, in its unit

@@ -57,12 +57,12 @@ class Fitted:
     volume: float  # k/2 log 2 pi - 1/2 log |H|
     average: Averaged
     powers: tuple[np.ndarray, ...]
-    sd: Mapping[str, float]  # of the effects' parameters
+    sd: Mapping[str, float]  # standard deviations of the effects' parameters
     rough_plant: Plant
     rough: Fit  # refit in white noise: its free run is closest to the data, and extensions start there
     rough_powers: tuple[np.ndarray, ...]
     curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
-    past: Past  # of earlier recordings
+    past: Past  # posterior of earlier recordings
 
     @property
     def absent(self) -> bool:

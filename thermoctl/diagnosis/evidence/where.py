@@ -32,10 +32,10 @@ class Responses:
     """Variance of each output by node and cell (eta, tau) over the bands of its recordings."""
 
     nodes: tuple[str, ...]
-    white: list[np.ndarray]  # per channel (nodes, bands)
+    white: list[np.ndarray]  # (nodes, bands) by channel, F of the module's docstring
     share: np.ndarray  # (cells,) eta
     corner: np.ndarray  # (cells,) tau
-    intervals: list[float]  # of the recordings
+    intervals: list[float]  # s, sampling interval by recording
 
     def cells(
         self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], node: int

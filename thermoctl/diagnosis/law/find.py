@@ -88,8 +88,9 @@ def refits(
 ) -> list[Tried]:
     """Refit the proposals that may beat the best law so far, and sums without an insignificant term.
 
-    `cost`: minus the log prior odds of a law; `least`: least useful log posterior odds. A promise is the
-    first-order gain. Every promise is multiplied by the largest ratio so far of a refit's gain to it."""
+    `cost`: minus the log prior odds of a law; `least`: log posterior odds that a law must reach. A promise is
+    the first-order gain. All promises are multiplied by the largest ratio so far of a refit's gain to its
+    promise."""
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
     gain, ratio, leader, left = max(least, 0.0), 1.0, parent, affordable(case, parent)

@@ -99,7 +99,7 @@ class Term:
     form: Form
     signals: tuple[Signal, ...]
     shapes: Mapping[str, float] = field(default_factory=dict)
-    duration: float = 1.0  # of the longest run, s
+    duration: float = 1.0  # s, of the longest recording
     sample: float = 1.0  # interval between samples, s
 
     @property
@@ -221,7 +221,7 @@ def families(
 
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
-    """Return the signals of a form whose first one is z."""
+    """Return the tuples of signals that a form may have with z as the first one."""
     if form.of not in ("two", "driven"):
         return [(z,)]
     second = [w for w in every if w != z and not w.daily and (w.drives or form.of == "two")]

@@ -34,7 +34,8 @@ POOL = 60  # number of terms from which sums of terms are built
 PAIRED = 600  # number of terms that are tried two at a time
 PAIRS, LIKELY = 24, 50_000  # number of pairs that are kept; number of best pairs among which they are sought
 GROWN = 8  # number of pairs, those with the best score, to which a third term is added
-PROPOSALS, SINGLE, SIGNALS = 14, 5, 4  # number of proposals; of one-term ones first; of those by signal
+# Number of proposals in all; of those with one term, by score; of those with one term and different signals.
+PROPOSALS, SINGLE, SIGNALS = 14, 5, 4
 TERMS = 3
 ZOOMS, FINE = 2, 9  # number of finer grids of the shapes of a term; number of values of each shape in them
 CHUNK = 256  # number of terms whose responses are computed at a time

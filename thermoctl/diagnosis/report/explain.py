@@ -8,7 +8,7 @@ from typing import Any
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import what_next
 
-SHOWN, LOST = 4, 3  # largest number of hypotheses shown; of effects that were tried and lost
+SHOWN, LOST = 4, 3  # largest number of hypotheses; largest number of effects that were tried and lost
 
 
 def explain(found: Mapping[str, Any]) -> str:

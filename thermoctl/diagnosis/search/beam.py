@@ -82,7 +82,7 @@ class Search:
     where: Mapping[str, set[str]]
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
-    norms: list[Norms] = field(default_factory=list)  # of the screening without effects
+    norms: list[Norms] = field(default_factory=list)  # norms of the screening without effects
     refitted: set[Keys] = field(default_factory=set)  # extensions, kept or not: none is refitted twice
     promised: dict[Key, float] = field(default_factory=dict)  # largest first-order gain of a placed effect
     refused: dict[Keys, str] = field(default_factory=dict)  # refits that are no hypotheses: why
@@ -372,7 +372,8 @@ def _expected(
 
     `untried`: share of the shortlist."""
     if not any(w.fitted.hypothesis.effects for w in tried):
-        return CLOSE * limits.beam * untried  # it may end with the next one, or extend every beam
+        # The search may end with the next hypothesis, or extend every beam.
+        return CLOSE * limits.beam * untried
     if not only_noise(case, leader, limits):
         return np.inf
     scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]

@@ -56,7 +56,7 @@ class Metric:
         raise NotImplementedError
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
-        """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
+        """Apply the transpose of `unweighted` to rows w (rows, k): return (N, outputs, k) of recording r."""
         raise NotImplementedError
 
     def project(self, d: np.ndarray) -> np.ndarray:

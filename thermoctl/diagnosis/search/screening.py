@@ -152,7 +152,7 @@ class Rows(Metric):
         )
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
-        """Return (N, outputs, k): the transpose of `unweighted`, of all rows (rows, k), for recording r."""
+        """Apply the transpose of `unweighted` to rows w (rows, k): return (N, outputs, k) of recording r."""
         d, at = self.drives[r], 0
         out = np.zeros((*d.y.shape, w.shape[1]))
         for c in self.plain.coordinates.channels:

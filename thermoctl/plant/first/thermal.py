@@ -23,7 +23,7 @@ from thermoctl.recording.table import Table
 MARGIN = 5.0  # the ranges of a first guess reach from value / MARGIN to value * MARGIN
 UNKNOWN_SCALE = 200.0  # and so much further where the heat is known up to a factor that the user has to write
 ABSENT = 1e-5  # least conductance as a share of the guess: as good as none, for links that do not exist
-FEW_BODIES = 3  # up to so many bodies every pair gets a link, beyond that neighbours only
+FEW_BODIES = 3  # with more bodies only neighbours get a link, not every pair
 FULL = {1.0: "", 100.0: " / 100", 255.0: " / 255"}  # ends of a duty's scale, and what divides it
 
 
@@ -135,7 +135,7 @@ def _heat(table: Table, c: Column, ids: Mapping[str, str], drives: Sequence[Colu
         return _Heat(c, f"R{own} * {name}**2", line, size, False)
     if c.kind == "voltage":
         if len(currents) == 1 and not alike:
-            return _Heat(c, "", "", values, True)  # its power is that of the current
+            return _Heat(c, "", "", values, True)  # the power of the heater is that of its current
         line = unknown(f"R{own}", "ohm", f"resistance that '{c.name}' heats, measured")
         return _Heat(c, f"{name}**2 / R{own}", line, values**2, False)
     if c.kind == "duty":

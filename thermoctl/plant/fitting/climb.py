@@ -27,7 +27,7 @@ STRAIGHT = 0.75  # share of its promise that a step gains, from which the next o
 CURVED = 0.75  # largest acceleration, as a share of the step
 SLOW = 20.0  # a step is slow if more than this many such steps are needed
 SLOW_STEPS = 3  # end after so many slow steps in a row
-INSIDE = 1e-9  # of the gradient: a slope at a bound that is not zero by rounding
+INSIDE = 1e-9  # least share of the gradient that is not a rounding error, for a slope at a bound
 
 T = TypeVar("T")
 

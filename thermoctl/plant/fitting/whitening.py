@@ -77,7 +77,7 @@ class Whitening:
     def of(cls, d: Excitation, j: int, noise: Noise) -> Whitening:
         """Return the whitening of output j in a recording."""
         index = measured(d.y[:, j])
-        if noise.phi <= 0:  # one number each, not one a sample
+        if noise.phi <= 0:  # phi and sigma are one number each, not one for each sample
             phi = np.broadcast_to(0.0, max(len(index) - 1, 0))
             return cls(noise, index, phi, np.broadcast_to(noise.sigma, len(index)))
         dt = float(np.median(np.diff(d.t))) if len(d.t) > 1 else 1.0
@@ -98,7 +98,7 @@ class Whitening:
         part = e if len(self.index) == len(e) else e[self.index]
         shape = (-1, *([1] * (part.ndim - 1)))
         if len(self.noise.ar) > 1 and len(self.index) > 1:
-            from scipy.signal import lfilter  # its import takes longer than most plants' simulation
+            from scipy.signal import lfilter  # importing scipy.signal takes longer than most simulations
 
             return lfilter(self.noise.ar, self.noise.ma, part, axis=0) / self.noise.sigma
         if len(self.index) > 1 and self.phi.any():

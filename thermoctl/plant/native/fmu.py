@@ -41,7 +41,7 @@ _FUNCTIONS = {  # in the order of fmu.h
     "UpdateDiscreteStates EnterContinuousTimeMode Reset Reset EnterInitializationMode ExitInitializationMode "
     "GetDirectionalDerivative SetBoolean SetInt32 SetInt64",
 }
-_TYPES = {  # of the variables that a recording may drive: as in fmu.h; the getter of FMPy
+_TYPES = {  # types of variables that a recording may drive: number in fmu.h, getter of FMPy
     "Real": (0, "getReal"),
     "Float64": (0, "getFloat64"),
     "Boolean": (1, "getBoolean"),
@@ -264,7 +264,7 @@ def _compiled(path: Path, d: ModelDescription, folder: Path) -> None:
     import fmpy
 
     name = d.modelExchange.modelIdentifier
-    names = (fmpy.platform, fmpy.platform_tuple)  # of FMI 2 and FMI 3
+    names = (fmpy.platform, fmpy.platform_tuple)  # names of the platform in FMI 2 and in FMI 3
     if any((folder / "binaries" / n / f"{name}{fmpy.sharedLibraryExtension}").exists() for n in names):
         return
     there = sorted(p.name for p in (folder / "binaries").glob("*")) or ["none"]

@@ -14,7 +14,7 @@ from thermoctl.plant.simulation.ahead import ahead, all_uncertain
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-BLOCKS = 50  # of a recording whose last state is estimated
+BLOCKS = 50  # number of blocks of a recording whose last state is estimated
 SETTLED = 1e-6  # largest change of a steady state, as a share of its size, over half a run
 LONGER, RUNS = 4.0, 16  # each run to a steady state lasts so many times longer; the number of runs
 

@@ -30,7 +30,8 @@ KINDS = {
     "bare": 0,
 }
 STEP = 50  # points of an interval that the file states
-NAMED, COUNTED, FOREIGN = 30, -30, -60  # a name of times; of a counter; a unit that is none of time
+# Points for a name of times, for a name of a counter, for a unit that is not one of time.
+NAMED, COUNTED, FOREIGN = 30, -30, -60
 STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
 NEEDED = 30  # points from which a column is a clock
 SURE = 60  # points from which a clock stands, though another column holds wrong dates
@@ -39,7 +40,7 @@ MILLI = 1000
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
 _OTHERS = WORDS["other_times"].split()
-MOST_WORDS = 3  # of a counter's name
+MOST_WORDS = 3  # largest number of words in a counter's name
 _FIELDS = {  # names of the parts of a date that have a column each
     "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
     "month": ("month", "mm", "mon", "monat", "mois", "mes", "mese"),
@@ -259,7 +260,7 @@ def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: 
         points += FOREIGN
         why.append(f"unit {unit}")
     if kind == "bare" and by_name <= 0 and not generic:
-        points += COUNTED  # it only increases, as any signal may
+        points += COUNTED  # the column only increases, as any signal may
     if kind == "bare":
         note = "its unit is assumed: s"
         note = f"a counter, for want of times; {note} a step" if counter else note

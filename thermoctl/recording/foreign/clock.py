@@ -21,14 +21,15 @@ _MONTHS |= dict(
 _MONTHS |= dict(dic=12, gen=1, mag=5, giu=6, lug=7, set=9, ott=10, maj=5, mrt=3, mei=5, juin=6, juil=7, aug=8)
 _ZONES = dict(z=0, utc=0, gmt=0, wet=0, west=1, bst=1, cet=1, cest=2, mez=1, mesz=2, eet=2, eest=3, msk=3)
 _ZONES |= dict(est=-5, edt=-4, cdt=-5, mst=-7, mdt=-6, pst=-8, pdt=-7, jst=9, kst=9, aest=10, aedt=11)
-_LETTER = r"[^\x00-\x40\x5B-\x60\x7B-\x7F]"  # of any alphabet; \pL takes Arrow milliseconds to compile
+# A letter of any alphabet; Arrow needs milliseconds to compile \pL.
+_LETTER = r"[^\x00-\x40\x5B-\x60\x7B-\x7F]"
 _DATE = r"(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|{L}{3,4})[-/.](?P<c>\d{1,4})".replace("{L}", _LETTER)
 _CLOCK = (
     r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<p>[AaPp][Mm])?"
     r"\s*(?P<z>[+-]\d{2}:?\d{2}|[A-Za-z]{1,4})?"
 )
 _PATTERN = rf"^(?:{_DATE}(?:[T ,;]\s*|$))?(?:{_CLOCK})?$"
-# Other spellings, brought to the pattern's before it is tried: (expression, replacement).
+# Replacements of other spellings, before the pattern is tried: (expression, replacement).
 _SPELLINGS = tuple(
     (pattern.replace("{L}", _LETTER), by)
     for pattern, by in (

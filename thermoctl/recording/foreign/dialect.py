@@ -22,12 +22,13 @@ from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit,
 from thermoctl.units import SECONDS
 
 SAMPLE = 400  # lines that decide
-FEW = 5  # lines; of more, a head takes at most half
+FEW = 5  # in a file with more lines, the head takes at most half of them
 SEPARATORS = (",", ";", "\t", "|", "  ", " ")
-HEAD_LINES = 6  # above the data, of which names, units and the kind of value are taken
+HEAD_LINES = 6  # number of lines above the data from which names, units and kinds of values are taken
 UNIT_LENGTH = 16  # characters of a cell in a line of units
 _COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|NUM|REF|BEZUG|NULL)!))")
-_RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")  # below the header of a table in Markdown or SQL
+# The line below the header of a table in Markdown or SQL.
+_RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")
 FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (Rigol)
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
@@ -69,7 +70,7 @@ def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     head = data[:4096]
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         encoding = "utf-16"
-    elif head.count(0) > len(head) / 5:  # of Latin text every other byte is zero
+    elif head.count(0) > len(head) / 5:  # in UTF-16, every other byte of Latin text is zero
         encoding = "utf-16-be" if head[:1] == b"\0" else "utf-16-le"
     else:
         try:
@@ -288,7 +289,7 @@ def _header(
         notes.append("no header: the columns are called column_1, column_2 ...")
         return tuple(f"column_{i + 1}" for i in range(width)), {}, (), set()
     if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):  # noqa: PLR2004
-        lines_of.pop()  # below the units (Origin)
+        lines_of.pop()  # the line below the units (Origin)
     below: list[tuple[int, list[str]]] = []
     while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
         below.append(lines_of.pop())

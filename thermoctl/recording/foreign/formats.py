@@ -343,7 +343,7 @@ def write_mdf(path: str, table: Table) -> None:
             ],
             comment=f"thermoctl recording {table.name}",
         )
-        if "wall_s" in table.columns:  # other programs then show the time of day
+        if "wall_s" in table.columns:  # with an absolute time, other programs show the time of day
             mdf.start_time = datetime.fromtimestamp(table.columns["wall_s"][0] - table.t[0], UTC)
         mdf.save(path, overwrite=True, compression=2)
 

@@ -412,7 +412,8 @@ def _any_value(row: Sequence[str]) -> bool:
     return any(cells.is_number(c) or clock.is_time(c) for c in row)
 
 
-# ------------------------------------------------------------------------------------------- cells, clock, table
+# ------------------------------------------------------------------------------------------- cells, clock,
+# table
 def _table(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str]) -> Table:
     """Return the table of a file's sheets, each timed by its own clock."""
     try:
@@ -441,10 +442,10 @@ def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str])
         raise InputError(f"{path}: no column of numbers beside the time; columns of text: {text or 'none'}")
     if not len(table):
         raise InputError(f"{path}: no rows; at least one sample was expected")
-    alike: dict[str, str] = {}  # of clocks that differ by their start the earliest
+    earliest: dict[str, str] = {}  # of notes that differ only in a clock's start, the earliest
     for note in (n for p in parts for n in p.notes):
-        alike[_SINCE.sub("", note)] = min(note, alike.get(_SINCE.sub("", note), note))
-    every = tuple(dict.fromkeys([*notes, *later, *alike.values()]))
+        earliest[_SINCE.sub("", note)] = min(note, earliest.get(_SINCE.sub("", note), note))
+    every = tuple(dict.fromkeys([*notes, *later, *earliest.values()]))
     how.trace.extend(f"note: {n}" for n in every)
     return replace(table, notes=every)
 

@@ -19,7 +19,7 @@ _SYMBOL = (
     r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|rpm|rps|kn|dBm|dB|"
     r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|eV|Wb|lx|rad|Ah))"
 )
-ANGLES = (), dimension("Hz")  # of these pint takes a radian for 1, and a turn for 2 pi
+ANGLES = (), dimension("Hz")  # dimensions in which pint takes a radian for 1 and a turn for 2 pi
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
 _UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
