@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from thermoctl import cli
+from thermoctl.cli.commands import COMMANDS
 from thermoctl.command import PURPOSES
-from thermoctl.commands import COMMANDS
 
 
 def refused(capsys, *words):

@@ -23,7 +23,7 @@ def test_no_package_has_faults():
     ],
 )
 def test_each_rule(text, fault):
-    found = Text(ROOT / "thermoctl/cli.py", 1, text, 80).faults()
+    found = Text(ROOT / "thermoctl/cli/__init__.py", 1, text, 80).faults()
     assert not found if fault is None else [f for f in found if fault in f], found
 
 

@@ -3,14 +3,14 @@
 import os
 import shutil
 
+from tests.reference import DOCS, pages, stale
 from thermoctl.configuration.settings import options
 from thermoctl.control.faults import FAULTS, KINDS
-from thermoctl.reference import DOCS, pages, stale
 
 
 def test_pages_are_not_stale():
     before = dict(os.environ)
-    assert stale() == [], "run python -m thermoctl.reference"
+    assert stale() == [], "run python -m tests.reference"
     assert dict(os.environ) == before, "the pages' width is not the terminal's"
 
 

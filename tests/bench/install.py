@@ -25,7 +25,7 @@ STEPS = (
     "service install --config config/simulated.yaml --root root",
 )
 WITH_ALL = ("check config/wire.yaml", "devices list", DIAGNOSE)
-IMPORTS = ("thermoctl", "thermoctl.api", "thermoctl.commands", "thermoctl.daemon.tick.loop")
+IMPORTS = ("thermoctl", "thermoctl.api", "thermoctl.cli.commands", "thermoctl.daemon.tick.loop")
 PIP = ("-m", "pip", "--disable-pip-version-check", "-qq")
 
 

@@ -88,7 +88,7 @@ def test_a_channel_is_added_in_one_row():
         """
 import numpy as np
 from thermoctl_hal.base.backend import ROLES, Sample
-from thermoctl import reference
+from tests import reference
 from thermoctl.rig import channels, signals
 from thermoctl.control import causes, faults, law, model
 from thermoctl.daemon.answers import readings
@@ -135,7 +135,7 @@ def test_a_limit_is_added_in_one_row(tmp_path):
     found = run_with(
         {"thermoctl.control.limits": (anchor, row + anchor)},
         f"""
-from thermoctl import reference
+from tests import reference
 from thermoctl.configuration import settings
 from thermoctl.control import law, model, typed
 from thermoctl.daemon.tick.assemble import law_parameters
@@ -161,7 +161,7 @@ def test_a_fault_is_added_in_one_row():
         },
         """
 import numpy as np
-from thermoctl import reference
+from tests import reference
 from thermoctl.rig import signals
 from thermoctl.control import arming, faults, law, recorded_faults
 from thermoctl.control.model import Parameters, zero_model

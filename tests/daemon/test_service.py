@@ -12,10 +12,10 @@ import pytest
 
 from tests.daemon.process import ROOT, Daemon
 from thermoctl.cli import main
+from thermoctl.cli.manual import PLACES
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import lock, service
 from thermoctl.files.yamlfile import InputError
-from thermoctl.manual import PLACES
 
 
 # ------------------------------------------------------------------------------------------------ lock and socket

@@ -77,7 +77,7 @@ def test_every_import_is_declared():
 
 EACH_ALONE = """
 import importlib, os, sys
-from thermoctl.commands import COMMANDS
+from thermoctl.cli.commands import COMMANDS
 from thermoctl.extras import EXTRAS, lacking
 for packages in EXTRAS.values():
     for module in packages:

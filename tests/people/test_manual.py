@@ -6,8 +6,8 @@ import subprocess
 import pytest
 
 from thermoctl import cli
+from thermoctl.cli.manual import PLACES, install, manual_page, uninstall
 from thermoctl.files.yamlfile import InputError
-from thermoctl.manual import PLACES, install, manual_page, uninstall
 
 
 def test_every_command_and_option_is_in_the_page():

@@ -7,9 +7,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from thermoctl import cli
+from thermoctl.cli.support import without_secrets
 from thermoctl.configuration.settings import load_settings
 from thermoctl.recording.writer import RecordingWriter
-from thermoctl.support import without_secrets
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Rows of the command table for commands of this package alone; thermoctl/root_commands.py has the others."""
+"""Rows of the command table for commands of this package alone; cli/command_table.py has the others."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ import argparse
 import importlib
 from typing import Any
 
-from thermoctl import root_commands
 from thermoctl.advice import command_table as advice
 from thermoctl.calibration import command_table as calibration
+from thermoctl.cli import command_table as joined
 from thermoctl.command import CONFIG, PURPOSES, Command
 from thermoctl.daemon import command_table as daemon
 from thermoctl.devices import command_table as devices
@@ -19,19 +19,7 @@ from thermoctl.identify import command_table as identify
 from thermoctl.plant import command_table as plant
 from thermoctl.recording import command_table as recording
 
-_TABLES = (
-    daemon,
-    root_commands,
-    devices,
-    recording,
-    calibration,
-    plant,
-    advice,
-    export,
-    identify,
-    diagnose,
-    fleet,
-)
+_TABLES = (daemon, joined, devices, recording, calibration, plant, advice, export, identify, diagnose, fleet)
 BY_PURPOSE: dict[str, tuple[Command, ...]] = {
     purpose: tuple(row for table in _TABLES for row in table.TABLE.get(purpose, ())) for purpose in PURPOSES
 }

@@ -10,8 +10,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 
 from thermoctl import __version__
+from thermoctl.cli.commands import BY_PURPOSE, COMMANDS, GROUPS, call, takes_axis
 from thermoctl.command import AXIS
-from thermoctl.commands import BY_PURPOSE, COMMANDS, GROUPS, call, takes_axis
 from thermoctl.configuration import which_rig
 from thermoctl.extras import lacking
 from thermoctl.files.yamlfile import InputError
@@ -147,7 +147,3 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"thermoctl: {e}", file=sys.stderr)
         return 3
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,10 +1,6 @@
-"""Commands that join the work of two packages, and commands of the root's modules: rows and functions."""
+"""Rows of the command table: commands that join packages (their functions are in joined.py), and help."""
 
 from __future__ import annotations
-
-import argparse
-from pathlib import Path
-from typing import Any
 
 from thermoctl.command import (
     CONFIG,
@@ -26,7 +22,7 @@ TABLE: Table = {
         command(
             "run",
             "run the daemon in the foreground (as systemd does), or its tick in simulated time",
-            "thermoctl.root_commands:run",
+            "thermoctl.cli.joined:run",
             "",
             CONFIG,
             argument(
@@ -45,7 +41,7 @@ TABLE: Table = {
         command(
             "virtual-rig",
             "simulate the devices of a configuration at the other end of their wires, in real time",
-            "thermoctl.root_commands:virtual_rig",
+            "thermoctl.cli.joined:virtual_rig",
             "settings tell",
             CONFIG,
             argument(
@@ -58,7 +54,7 @@ TABLE: Table = {
         command(
             "service",
             "install or remove the systemd unit, its user, its device rules, the manual page and the shell completions",
-            "thermoctl.root_commands:service",
+            "thermoctl.cli.joined:service",
             "",
             argument("action", choices=["install", "uninstall"]),
             CONFIG,
@@ -69,7 +65,7 @@ TABLE: Table = {
         command(
             "diagnose",
             "find where simulation and recordings differ, which physics is missing, and what adding it gains",
-            "thermoctl.root_commands:diagnose",
+            "thermoctl.cli.joined:diagnose",
             "",
             argument(
                 "recordings",
@@ -176,7 +172,7 @@ TABLE: Table = {
             "effects",
             "list the catalogue of effects, show one (`effects show NAME`), check files of your own (`effects check FILE`), "
             "or save the law of a diagnosis as one (`effects save DIR NAME`)",
-            "thermoctl.root_commands:effects",
+            "thermoctl.cli.joined:effects",
             "",
             argument("action", nargs="?", metavar="show|check|save"),
             argument(
@@ -204,7 +200,7 @@ TABLE: Table = {
         command(
             "report",
             "write one archive for a question to others: versions, configuration, log, the end of the newest recording",
-            "thermoctl.support:report",
+            "thermoctl.cli.support:report",
             "settings out seconds",
             CONFIG,
             argument(
@@ -224,122 +220,17 @@ TABLE: Table = {
         command(
             "completion",
             "print the shell's completion script; source it",
-            "thermoctl.manual:completion",
+            "thermoctl.cli.manual:completion",
             "parser shell",
             argument("shell", choices=["bash", "zsh", "tcsh"]),
         ),
         command(
             "manual",
             "show the manual page, or install it with the shell completions",
-            "thermoctl.manual:command",
+            "thermoctl.cli.manual:command",
             "parser action root",
             argument("action", nargs="?", choices=["show", "install", "uninstall"], default="show"),
             ROOT,
         ),
     ),
 }
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the daemon in the foreground, or its tick in simulated time."""
-    from thermoctl.configuration.settings import load_rig, load_settings
-
-    if args.hours is None:
-        from thermoctl.daemon import supervisor
-        from thermoctl.files.yamlfile import InputError
-
-        if args.axis:
-            raise InputError(
-                "run: --axis goes with --simulated-time and --hours; the daemon runs all axes of a rig"
-            )
-
-        return supervisor.run(load_rig(args.config))
-    from thermoctl.daemon.offline.simulate import trapezoids
-
-    return trapezoids(load_settings(args.config), args.hours, not args.no_compensation, args.out)
-
-
-def virtual_rig(settings: Any, line: str) -> int:
-    """Simulate the devices of a configuration, or send `line` to a running virtual rig."""
-    from thermoctl.files.yamlfile import InputError
-    from thermoctl_hal.virtual.rig import main
-
-    if settings.hal.backend != "devices":
-        raise InputError(
-            f"{settings.path}: no devices to simulate: hal.backend is '{settings.hal.backend}'; "
-            "give --config config/wire.yaml"
-        )
-    return int(main(settings, line))
-
-
-def service(args: argparse.Namespace) -> int:
-    """Install or remove the unit. Removing the last unit removes manual page and completions, too."""
-    from thermoctl import manual
-    from thermoctl.daemon.service import install, uninstall, units
-
-    root, config = Path(args.root), Path(args.config) if args.config else None
-    if args.action == "install":
-        return install(config or Path(), root) or manual.command(args.parser, "install", args.root)
-    if (done := uninstall(config, root)) or units(root):
-        return done
-    return manual.command(args.parser, "uninstall", args.root)
-
-
-def effects(args: argparse.Namespace) -> int:
-    """List the catalogue of effects, show one, or check effect files."""
-    if args.action == "check":
-        from thermoctl.advice.commands import check_effects
-
-        return check_effects(args)
-    if args.action == "save":
-        from thermoctl.diagnosis.commands import save_law
-
-        return save_law(args)
-    from thermoctl.diagnosis import show
-
-    args.name = args.files[0] if args.files else None
-    return show.effects(args)
-
-
-def diagnose(args: argparse.Namespace) -> int:
-    """Diagnose recordings, folders of rigs or a live rig; with --resolve the experiments run on the rig."""
-    from thermoctl.files.yamlfile import InputError
-
-    if args.explain:
-        from thermoctl.diagnosis.show import explained
-
-        return explained(args.explain, args.why)
-    for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
-        if not value:
-            raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")
-    if args.live:
-        from thermoctl.fleet.commands import live_recordings
-
-        args.recordings = live_recordings(args)
-        if not args.recordings:
-            return 0
-    from thermoctl.fleet.recordings import expanded
-
-    args.recordings = expanded(args.recordings, args.together)
-    if any(Path(r).is_dir() for r in args.recordings):
-        if args.time or args.columns or args.held_out:
-            raise InputError(
-                "diagnose: --time, --columns and --held-out go with recordings, not with folders; make the folder's files with "
-                "`thermoctl recordings import`"
-            )
-        from thermoctl.fleet.commands import diagnose_folders
-
-        return diagnose_folders(args)
-
-    def record(experiment: Path, recording: Path) -> None:
-        """Run an experiment file on the rig for --resolve and write its recording.
-
-        Raises HardwareError where it ends early, InputError where the user does not confirm it."""
-        from thermoctl.calibration.commands import record
-
-        record(experiment, recording, args.config, args.rig, args.yes)
-
-    from thermoctl.diagnosis import commands
-
-    args.record = record
-    return commands.diagnose(args)

@@ -1,6 +1,6 @@
 """The reference pages in docs/, written from the tables in the code.
 
-`python -m thermoctl.reference [--check]`.
+`python -m tests.reference [--check]`.
 
 They are configuration, device-profiles, signals, faults, effects, cli and commands-that-act in
 docs/reference, and one page a fault in docs/faults.
@@ -30,7 +30,7 @@ from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.profiles.keys import TABLES
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-_HEAD = "<!-- Written by `python -m thermoctl.reference`; change the table in the code, not this page. -->\n"
+_HEAD = "<!-- Written by `python -m tests.reference`; change the table in the code, not this page. -->\n"
 _HELP_WIDTH = 108  # columns of a command's help: argparse's own for a terminal of 110
 _SEVERITY = {
     "warning": "a warning: shown and recorded, drives nothing off.",
@@ -283,14 +283,14 @@ def stale(docs: Path = DOCS) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Write the pages, or with --check list the stale ones (exit status 1)."""
-    parser = argparse.ArgumentParser(prog="python -m thermoctl.reference", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__)
     parser.add_argument(
         "--check", action="store_true", help="write nothing; exit status 1 when a page is stale"
     )
     if parser.parse_args(argv).check:
         wrong = stale()
         for page in wrong:
-            print(f"docs/{page} is stale: run python -m thermoctl.reference", file=sys.stderr)
+            print(f"docs/{page} is stale: run python -m tests.reference", file=sys.stderr)
         return 1 if wrong else 0
     for path, text in pages().items():
         (DOCS / path).parent.mkdir(parents=True, exist_ok=True)
