@@ -207,10 +207,6 @@ test-browser: develop docs         # the dashboard, the reports and the site in 
 pictures: develop                  # test-browser, and its screenshots into docs/images
 	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py tests/people/test_calibrate.py
 
-.PHONY: test-fleet
-test-fleet: develop                # many rigs' recordings, from a folder and an object store, also spread by Dask
-	$(BIN)/python -m pytest -m "slow or not slow" tests/fleet/test_fleet.py
-
 .PHONY: test-wizard
 test-wizard: develop               # thermoctl calibrate from doctor to proof, with shortened tests
 	$(BIN)/python -m pytest -m slow tests/people/test_calibrate.py

@@ -25,9 +25,8 @@ EXTRAS = {
         "nptdms": "npTDMS",
         "openpyxl": "openpyxl",
     },
-    "mqtt": {"paho": "paho-mqtt"},
     "fmu": {"fmpy": "FMPy"},
-    "fleet": {"dask": "dask", "distributed": "distributed", "fsspec": "fsspec"},
+    "fleet": {"dask": "dask", "distributed": "distributed"},
 }
 """The package to install by the name that is imported, for each extra of pyproject.toml."""
 
