@@ -44,7 +44,7 @@ def check_effects(args: argparse.Namespace) -> int:
 
 
 def plan_experiment(args: argparse.Namespace) -> int:
-    """`thermoctl plan`: print what recordings like these would show of a plant. Raises InputError."""
+    """`thermoctl plan`: print which effects and parameters recordings like these show. Raises InputError."""
     plant = load(args.plant, args.map)
     tables = read_recordings(plant, args.like or (), **options(args))
     entries = catalogue((CATALOGUE, *map(Path, args.effects or ())))
@@ -83,7 +83,7 @@ def _show(planned: Planned) -> None:
 
 
 def _effects(planned: Planned) -> Table:
-    """Return the table of effects, first those that have to be largest before they would be seen."""
+    """Return the table of effects, those with the largest smallest visible size first."""
     heads = ["effect", "where", "seen from", "which moves, before a refit"]
     shown = Table(*heads, box=None, header_style="bold", title="seen, the worst first", title_justify="left")
     seen = [v for v in planned.effects if v.reason is None]

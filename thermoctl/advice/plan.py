@@ -34,19 +34,20 @@ from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
 
-REST = {"degC": 20.0, "K": 293.15, "degF": 68.0}  # surroundings where nothing states them
-SETTLED = 3.0  # time constants after which a step has come to 95 %
+# Assumed temperature of the surroundings, by unit, if neither plant nor recording states it.
+REST = {"degC": 20.0, "K": 293.15, "degF": 68.0}
+SETTLED = 3.0  # a step reaches 95 % after this number of time constants
 LEVELS = 7  # number of levels of the course that is planned without a recording
 ROWS = 2000  # number of rows of that experiment
-ALONE = 1e-6  # share of a range's precision that is left where the readings alone are asked
+ALONE = 1e-6  # factor on the precision of the ranges, to ask what the readings alone determine
 
 
 @dataclass(frozen=True)
 class Parameter:
     """A free parameter after the experiment, with its standard error.
 
-    `identified`: the readings alone give it more closely than its range. `tied`: else the parameter or start
-    that it goes along with."""
+    `identified`: do the readings alone determine it better than its range? `tied`: if not, the parameter or
+    initial state that it cannot be separated from."""
 
     name: str
     value: float
@@ -67,7 +68,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Planned:
-    """All that a plan says."""
+    """The content of a plan."""
 
     checks: list[Finding]
     duration_s: float
@@ -161,7 +162,7 @@ def _problem(model: Model, tables: Sequence[Table]) -> Problem:
 
 
 def _covariance(problem: Problem, ranges: float = 1.0) -> np.ndarray:
-    """Return the covariance of the unknowns (k, k); `ranges`: weight of what the ranges say."""
+    """Return the covariance of the unknowns (k, k). `ranges`: factor on the precision of the ranges."""
     z = problem.start({})
     precision = np.where(np.arange(len(z)) < problem.n_parameters, UNIFORM * ranges, 1.0)
     return np.linalg.inv(problem.evaluate(z, True).matrix + np.diag(precision))
@@ -185,10 +186,10 @@ def parameters(model: Model, tables: Sequence[Table]) -> list[Parameter]:
 
 
 def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Ranges) -> Course | None:
-    """Return the course of the driven inputs that gives the parameters best; None if this one does.
+    """Return the course of the driven inputs with the least errors of the parameters; None if none is better.
 
-    It is one of the next experiment's family (diagnosis/experiment/design.py), as long as one recording.
-    The determinant of the parameters' covariance decides, of several recordings that of an average one."""
+    It is one of the candidates of diagnosis/experiment/design.py, as long as one recording. The determinant
+    of the parameters' covariance decides; of several recordings, that of an average one."""
     found = levers(plant, tables, tuple(limits), limits)
     if not found or not model.active:
         return None

@@ -83,7 +83,7 @@ def _of_frame(
         try:
             values[short] = np.asarray(column, float)
         except (TypeError, ValueError):
-            continue  # a column of texts
+            continue  # leave out a column of texts
         if values[short].shape != t.shape:
             raise InputError(
                 f"{name}: column '{header}' has {values[short].shape} values; {t.shape} were expected"

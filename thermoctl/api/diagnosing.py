@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 class FoundEffect:
     """One effect that the plant lacks.
 
-    `confirmed`: probability that it predicts what it was not fitted to. `parameters`: value, sd and unit by
-    name; `when`: intervals."""
+    `confirmed`: probability that it predicts data that it was not fitted to. `parameters`: value, sd and
+    unit by name; `when`: intervals."""
 
     effect: str
     where: str
@@ -52,14 +52,14 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result of a diagnosis; `found` holds all that the engine knows."""
+    """The result of a diagnosis. `found`: the whole outcome (thermoctl.diagnosis.result.Diagnosis)."""
 
     before: Plant
     found: Found
 
     @cached_property
     def json(self) -> dict[str, Any]:
-        """The result as of docs/reference/diagnosis.md."""
+        """Return the result as a dict; docs/reference/diagnosis.md describes its keys."""
         return contract(self.found)
 
     @property

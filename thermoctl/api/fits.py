@@ -1,4 +1,4 @@
-"""The result of a refit, and its residuals as a statistician looks at them."""
+"""The result of a refit: parameters, residual tests and profile likelihood."""
 
 from __future__ import annotations
 

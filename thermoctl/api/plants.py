@@ -24,7 +24,7 @@ class Plant:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by name."""
+        """Return the values of the parameters, by name."""
         return {p.name: p.value for p in self.description.parameters.values()}
 
     def with_values(self, values: Mapping[str, float]) -> Plant:

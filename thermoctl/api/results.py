@@ -33,22 +33,22 @@ class Simulation:
 
     @property
     def outputs(self) -> dict[str, np.ndarray]:
-        """Readings of perfect sensors."""
+        """Return the readings of sensors without noise (N,), by output."""
         return dict(zip(self.plant.description.outputs, self.run.y.T, strict=True))
 
     @property
     def states(self) -> dict[str, np.ndarray]:
-        """The nodes."""
+        """Return the values (N,) of the nodes, by node."""
         return dict(zip(self.plant.description.nodes, self.run.x.T, strict=True))
 
     @property
     def last(self) -> dict[str, float]:
-        """The nodes at the end: `x0` of a run that goes on from here."""
+        """Return the nodes' last values: `x0` of a run that continues from here."""
         return {n: float(x[-1]) for n, x in self.states.items()}
 
     @property
     def errors(self) -> dict[str, np.ndarray]:
-        """Measured minus simulated; NaN where not measured."""
+        """Return measured minus simulated outputs (N,), by output; NaN where not measured."""
         return dict(zip(self.plant.description.outputs, (self.excitation.y - self.run.y).T, strict=True))
 
     @property

@@ -102,7 +102,7 @@ def forecast(settings: Settings, schedule: Schedule, coil_c: float) -> tuple[np.
     um = np.abs(schedule.at(np.arange(10 * seconds) / 10)).reshape(seconds, 10).max(axis=1)
     model = compensator(settings)
     n = len(model.A_minus_I)
-    one = np.zeros((n + 1, n + 1))  # the model's step, with its power as a constant state
+    one = np.zeros((n + 1, n + 1))  # matrix of the model's step, with the power as one more, constant state
     one[:n, :n], one[:n, n], one[n, n] = np.eye(n) + model.A_minus_I, model.B[:, 0], 1.0
     second = np.linalg.matrix_power(one, round(1.0 / model.period_s))
     power, rise, x = np.zeros(seconds), np.zeros(seconds), np.zeros(n + 1)

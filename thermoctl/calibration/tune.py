@@ -25,7 +25,7 @@ from thermoctl_hal.base.backend import HardwareError
 
 FASTER = 1.05  # a proposal for a loop with good margins must raise kp/ti by this factor
 DIVERGES = 5.0  # a step ends at once at this multiple of the first test's largest error
-TESTS = 1 + 3  # tests of a tuning at most: FACTOR is reached in three steps of STEP
+TESTS = 1 + 3  # largest number of tests in a tuning: FACTOR is reached in three steps of STEP
 
 
 class Disagrees(HardwareError):

@@ -53,7 +53,7 @@ def checked(
 
 
 def refit(args: argparse.Namespace) -> int:
-    """`thermoctl refit`: after the checks, which stop it where a number would take the shape of a mistake.
+    """`thermoctl refit`: after the checks. A severe finding stops it: a parameter would absorb the mistake.
 
     Raises InputError."""
 
@@ -72,7 +72,7 @@ def refit(args: argparse.Namespace) -> int:
 
 
 def simulate(args: argparse.Namespace) -> int:
-    """`thermoctl simulate`: after the checks, which do not stop it: it names nothing."""
+    """`thermoctl simulate`: after the checks, which do not stop it."""
 
     def read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
         """Read recordings; check those in which an output was measured."""

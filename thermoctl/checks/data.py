@@ -1,6 +1,6 @@
 """Checks of one recording by itself: gaps, repeated and resampled data, columns that do not move.
 
-Of an input that changes in most rows the plant file should say how it goes on between them.
+If an input changes in most rows, the plant file should state whether it is held or linear between rows.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from thermoctl.plant.language import Input
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-ALARM = 1e-6  # false alarms a column and recording
+ALARM = 1e-6  # probability of a false alarm for each column and recording
 SIGMAS = 6.0
-FEW = 8  # samples of which nothing can be stated
-FREE = 12  # iterations of a refit in which the plant has to move without its inputs
-SLOWS = 0.25  # share of its mean step, below which the last ones of a body that comes to rest lie
+FEW = 8  # with fewer samples nothing is checked
+FREE = 12  # iterations of the refit that tests whether the plant moves like this without its inputs
+SLOWS = 0.25  # a body comes to rest if its last steps are below this share of its mean step
 
 
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
@@ -90,10 +90,10 @@ def _gaps(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
 
 
 def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarray) -> list[Finding]:
-    """Find inputs that change in most rows, of which the plant file does not say how they go on between them.
+    """Find inputs that change in most rows, if the plant file does not say whether they are held or linear.
 
-    Straight lines would move the readings. Half the energy of that, in the noise, is the most that they could
-    gain in log likelihood. It has to exceed -log(ALARM)."""
+    Linear interpolation would change the simulated readings. Half the energy of this change, in the noise, is
+    the largest possible gain in log likelihood. It has to exceed -log(ALARM)."""
     moving = {n for n, u in zip(model.inputs, excitation.u.T, strict=True) if np.mean(np.diff(u) != 0) > 0.5}
     loose = [i for i in driving_inputs(model.plant) if i.name in moving and not i.stated]
     if not loose:
@@ -154,7 +154,7 @@ def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
 
 
 def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> list[Finding]:
-    """Find a stretch of noisy readings that stands twice.
+    """Find a stretch of noisy readings that occurs twice.
 
     Two independent second differences of noise agree with the probability of their commonest value. Smooth
     or coarse readings repeat by themselves and are left out."""
@@ -240,7 +240,7 @@ def _follows(y: np.ndarray, run: np.ndarray, scales: Sequence[float]) -> bool:
 
 
 def _by_itself(model: Model, excitation: Excitation, scales: Sequence[float]) -> bool:
-    """Return whether the plant can move so without its inputs, as one that rings or cools after its start."""
+    """Return whether the plant moves like this without its inputs, by ringing or cooling from its start."""
     try:
         found = refit.fit(model, [excitation], iterations=FREE)
     except (SimulationError, InputError):
@@ -249,7 +249,7 @@ def _by_itself(model: Model, excitation: Excitation, scales: Sequence[float]) ->
 
 
 def driving_inputs(plant: Plant) -> list[Input]:
-    """Return the inputs that a flow, an output or a storage reads; others only set the start."""
+    """Return the inputs that a flow, an output or a storage reads; others only set initial states."""
     read = [f.rate for f in plant.flows.values()] + [o.value for o in plant.outputs.values()]
     names = set().union(*(ex.names(e) for e in [*read, *(n.storage for n in plant.nodes.values())]))
     return [i for i in plant.inputs.values() if i.name in names]
@@ -267,7 +267,7 @@ def _surroundings(i: Input) -> bool:
 def _stuck(
     table: Table, column: str, y: np.ndarray, simulated: np.ndarray, t: np.ndarray, sd: float
 ) -> list[Finding]:
-    """Find a run of one value, longer than chance has it, over which the plant moves.
+    """Find a run of one value that is too long for chance, while the plant moves.
 
     At the end of the readings' range it is a sensor at its limit, which is physics. So is a body at rest: it
     comes to rest slowly, and leaves without a jump."""

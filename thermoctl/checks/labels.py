@@ -1,8 +1,8 @@
 """Wrong labels: swapped columns, other units, signs, a clock in other units, by comparing hypotheses.
 
-Each hypothesis changes the recordings as a person would correct them. Or it turns a flow of the plant that
-drives its own node away. It is weighed against the recordings as
-they are, both after a short refit inside the parameters' ranges:
+Each hypothesis changes the recordings as a person would correct them, or the sign of a flow that drives its
+own node away. It is compared with the recordings as they are, both after a short refit inside the parameters'
+ranges:
 
     gain = sum over outputs of n log(rms as it is / rms corrected)        (each rms over the output's spread)
 
@@ -33,14 +33,14 @@ from thermoctl.recording.table import Table
 from thermoctl.units import conversion, dimension
 
 RARITY = 1000.0  # prior odds against a wrong label
-CLOSE = 2.0  # residual over noise below which nothing is left to explain by labels
+CLOSE = 2.0  # residual over noise below which no wrong label is sought
 FOLLOWS = 0.5  # a corrected column has to be followed to within this share of its spread
 HALVED = 0.5  # share of the misfit of its columns that a correction may leave at most
 ROWS = 4_000  # largest number of rows of all recordings together, of each the first ones
 DRAWS = 4  # parameter draws of the screening
 ITERATIONS = 20  # largest number of iterations of a refit
-REFITTED = 6  # best screened hypotheses that are refitted
-ROUNDS = 3  # corrections in a row
+REFITTED = 6  # number of best screened hypotheses that are refitted
+ROUNDS = 3  # largest number of corrections, one after the other
 MAX_COLUMNS = 8  # with more columns, only pairs of the same unit are tried for a swap
 TEMPERATURES = ("degC", "degF", "K")
 FACTORS = (1e3, 1e-3, 1e6, 1e-6)
@@ -115,7 +115,7 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
 
 @dataclass(frozen=True)
 class _Misfit:
-    """By output: rms residual, the same over the spread of the readings, noise, independent residuals."""
+    """By output: rms residual; it over the spread of the readings; noise; number of independent residuals."""
 
     rms: np.ndarray
     share: np.ndarray
@@ -178,7 +178,7 @@ def _draws(plant: Plant) -> Iterator[dict[str, float]]:
 
 
 def _rms(residual: np.ndarray) -> np.ndarray:
-    """Return the rms by column; 1 where nothing is measured, so that it does not count."""
+    """Return the rms by column; 1 where nothing is measured, because its logarithm is then 0."""
     seen = np.isfinite(residual)
     count = np.maximum(seen.sum(axis=0), 1)
     mean = np.sum(np.where(seen, residual, 0.0) ** 2, axis=0) / count
@@ -238,7 +238,7 @@ def swaps(plant: Plant, tables: Sequence[Table]) -> Iterator[Hypothesis]:
 
 
 def _twice(outputs: Sequence[Output], first: Table) -> Iterator[Hypothesis]:
-    """Yield the temperatures that both the logger and the plant's value convert."""
+    """Yield the temperatures that are converted twice: by the logger, and by the plant's expression."""
     for o in outputs:
         for unit in TEMPERATURES if o.unit in TEMPERATURES else ():
             if unit != o.unit:
@@ -355,7 +355,7 @@ INDOORS = (-5.0, 45.0)  # degC, weather-protected places: IEC 60721-3-3, class 3
 
 
 def _ambient(plant: Plant, tables: Sequence[Table]) -> list[Finding]:
-    """Surroundings that are no place for people, but would be in Fahrenheit or kelvin."""
+    """Yield surroundings that are plausible only if their numbers are Fahrenheit or kelvin."""
     found = []
     for i, table in product(plant.inputs.values(), tables):
         if i.unit != "degC" or i.role != "ambient" or i.column not in table.columns:

@@ -17,7 +17,7 @@ from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationErr
 
 GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
 NYQUIST = np.pi  # sampling interval over time constant from which a mode lies beyond the Nyquist frequency
-SIGMAS = 6.0  # two-sided false alarm of 2e-9 a sample for normal errors
+SIGMAS = 6.0  # standard deviations of a contradiction: probability 2e-9 for a normal error
 
 
 def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Finding]:
@@ -84,7 +84,7 @@ def _storages(model: Model, excitation: Excitation) -> list[Finding]:
 
 
 def jacobian(plant: Plant, values: dict[str, float], flip: str | None = None) -> np.ndarray:
-    """Return d(dx/dt)/dx (nx, nx) per second; `flip` names a flow that is taken with the other sign."""
+    """Return d(dx/dt)/dx (nx, nx) in 1/s. `flip`: name of a flow whose sign is reversed."""
     index = {n: i for i, n in enumerate(plant.nodes)}
     out = np.zeros((len(index), len(index)))
     for flow in plant.flows.values():
@@ -167,7 +167,7 @@ def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
 
 
 def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float, float]]:
-    """Return by output how far the first sample is above the plant's start, and in standard deviations.
+    """Return by output the first sample minus the plant's initial value: in its unit, in standard deviations.
 
     Noise, initial_sigma and the parameters' ranges count. An output without a state is left out."""
     plant = model.plant

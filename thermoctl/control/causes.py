@@ -66,7 +66,7 @@ FOLLOWS: dict[str, set[str]] = {
     "compensation_bound": {"compensation_slewing"},
 }
 """Cause -> the faults that follow from it."""
-for _name in _of(*GROUPS):  # the same reading's other kinds, found later
+for _name in _of(*GROUPS):  # from a fault of a reading, its faults of later kinds follow
     _group, _kind = _name.rsplit("_", 1)
     FOLLOWS[_name] = FOLLOWS.get(_name, set()) | {
         f"{_group}_{k}" for k in KINDS if KINDS.index(k) > KINDS.index(_kind) and f"{_group}_{k}" in BIT

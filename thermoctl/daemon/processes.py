@@ -57,7 +57,8 @@ class Stop:
 
     def __call__(self) -> bool:
         if self.shared is not None:
-            self.shared.counters[BEATS + self.beat] += 1  # called once a round, so this counts the rounds
+            # A helper calls this once a round, so that it counts rounds.
+            self.shared.counters[BEATS + self.beat] += 1
         return self.asked
 
 

@@ -217,7 +217,7 @@ def _program() -> Path:
 
 
 def unseen(settings: Settings) -> list[str]:
-    """List what the unit could not read or write, each with its path and what to do.
+    """List the files that the unit could not read or write, each with its path and what to do.
 
     The unit sees no home and no temporary folder (ProtectHome=, PrivateTmp=), and writes only below
     /var/lib/thermoctl and /run/thermoctl (ProtectSystem=strict).

@@ -29,7 +29,7 @@ class Values:
 
 
 def values(plant: Plant, equations: Equations, recording: Table | None = None) -> Values:
-    """Return the numbers of an export; `recording` gives what only data can say.
+    """Return the numbers of an export; `recording` gives first readings and ranges.
 
     Raises InputError where the plant needs a recording and none is given."""
     asked = first_outputs(plant)

@@ -77,7 +77,7 @@ class Node:
         return f"{self.file}:{self.line}:{self.column}"
 
     def plain(self) -> Any:
-        """Return the value without places: dicts, lists and scalars."""
+        """Return the value as plain dicts, lists and scalars, without line numbers."""
         if isinstance(self.value, dict):
             return {k: v.plain() for k, v in self.value.items()}
         if isinstance(self.value, list):
@@ -90,7 +90,7 @@ class Node:
 
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
-    """' (did you mean X?)' where an allowed name is close, else ''."""
+    """Return ' (did you mean X?)' if an allowed name is close to `name`, else ''."""
     near = difflib.get_close_matches(str(name), list(allowed), n=1, cutoff=0.6)
     return f" (did you mean '{near[0]}'?)" if near else ""
 

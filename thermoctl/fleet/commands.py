@@ -86,7 +86,7 @@ def _diagnosis(job: Job, out: Path) -> RigDiagnosis:
 
 
 def _print_laws(found: Sequence[RigDiagnosis]) -> None:
-    """Print the laws of all rigs side by side, and what repeats in them."""
+    """Print the laws of all rigs side by side, and the parameters that repeat in them."""
     laws = {d.rig: d.law for d in found if d.law}
     if laws:
         console = Console(soft_wrap=True)

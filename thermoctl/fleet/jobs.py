@@ -1,4 +1,4 @@
-"""Diagnoses to run: files, outcome, and the fingerprint that says when a result is out of date."""
+"""Diagnoses to run: their files, their outcome, and a fingerprint that shows if a result is out of date."""
 
 from __future__ import annotations
 

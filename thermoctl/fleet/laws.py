@@ -11,7 +11,7 @@ from rich.table import Table
 from scipy.special import chdtrc
 
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
-CHANCE = 0.05  # probability of differences as large, below which values are not the same
+CHANCE = 0.05  # values differ if the probability of differences as large by chance is below this
 
 Term = tuple[str, str, tuple[str, ...], str]  # place, form, signals, name of a shape
 
@@ -79,5 +79,5 @@ def side_by_side(laws: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def comparisons(laws: Mapping[str, Mapping[str, Any]]) -> Sequence[str]:
-    """Return what repeats in the laws of several rigs, and what does not, as sentences."""
+    """Return sentences on the parameters that agree between the laws of several rigs, and that do not."""
     return [s.text for s in shared(laws)]

@@ -153,7 +153,7 @@ def measure(
 
 
 def _margins(loop: np.ndarray, error: np.ndarray) -> Measured:
-    """Read the margins off a loop at rising frequencies (K,); error: its relative standard error (K,)."""
+    """Return the margins of a measured loop at rising frequencies (K,); error: its relative error (K,)."""
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     cross = np.flatnonzero((size[:-1] >= 0) & (size[1:] < 0))
     if not len(cross):
@@ -172,7 +172,7 @@ def _margins(loop: np.ndarray, error: np.ndarray) -> Measured:
 
 
 def _lever(x: np.ndarray, y: np.ndarray, k: int) -> float:
-    """Return the error of y where x passes a value, when x and y have errors of 1: the place moves, too."""
+    """Return the error of y at the point where x passes a value, if x and y have errors of 1."""
     return math.hypot(1.0, (y[k + 1] - y[k]) / (x[k + 1] - x[k]))
 
 
@@ -190,9 +190,9 @@ def disagreement(
 ) -> str:
     """Return how a measured loop contradicts its prediction; '' if it does not.
 
-    models: the fitted one and its pessimist. A margin contradicts that is smaller, by its standard error,
-    than on the worse of both models, or not known well enough. A gain margin of twice the wanted one always
-    agrees."""
+    models: the fitted one and its pessimist. A margin contradicts them if it is below that of the worse
+    model by more than its standard error. So does a margin that is not known well enough. A gain margin of
+    twice the wanted one always agrees."""
     if not measured.is_sure:
         return (
             f"the margins are not known well enough ({measured}): at most +- {SURE_DEG:g} deg and +- {100 * SURE_GAIN:g} % were "

@@ -41,7 +41,7 @@ from thermoctl.files.yamlfile import InputError
 # No gains are proposed when the phase near the crossover has a larger standard error. A smaller one counts as
 # dead time.
 UNCERTAIN_DEG = 40.0
-ANSWERS = 10.0  # least gain of the response in its standard errors: a fit of noise reaches 5
+ANSWERS = 10.0  # least gain of the response over its standard error; a fit to noise alone reaches 5
 WANTED_DEG, WANTED_GAIN = 45.0, 2.0  # least phase margin and gain margin of a proposal
 # Largest change of a gain in one proposal. The recording was made with the present loop, whose motion hardly
 # reaches the frequencies at which a loop several times faster has its margins.
@@ -50,8 +50,8 @@ FACTOR = 3.0
 # margins does not become unstable by one step.
 STEP = 1.5
 TURNS = 3.0  # a loop's phase passes 180 deg at about this multiple of its crossover
-SHORTEST_S = 1e-6  # lag in the place of none
-BLOCK_S = 1.0  # the residuals of such blocks count as independent
+SHORTEST_S = 1e-6  # lag that stands for no lag
+BLOCK_S = 1.0  # length of a block of residuals; the blocks count as independent
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _covariance(slopes: np.ndarray, residuals: np.ndarray, block: int) -> np.nda
 
 
 def pessimist(model: SecondOrder, delay_s: float) -> SecondOrder:
-    """Return the slowest answer that the recording allows, for loops faster than the recorded one.
+    """Return the slowest response that the recording allows, for loops faster than the recorded one.
 
     A short lag becomes dead time; twice the standard error and delay_s are added."""
     more = delay_s + 2.0 * model.uncertain_s

@@ -73,7 +73,7 @@ class Conversion:
 class Input:
     """A recorded column that drives the simulation; `linear`: straight lines between samples, else held.
 
-    `stated`: whether the plant file says which; without a word an input is held."""
+    `stated`: does the plant file state which? By default an input is held."""
 
     name: str
     unit: str | None = None
@@ -127,7 +127,7 @@ class Flow:
 class Output:
     """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step.
 
-    `sensed`: the part of `value` that its electronics read, where a diagnosis added an error of theirs."""
+    `sensed`: if a diagnosis added an error of the electronics, the part of `value` that they read."""
 
     name: str
     value: Expr
@@ -148,7 +148,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Plant:
-    """A checked plant; `trusted`: its sensors are right, so that no fault of a reading is looked for."""
+    """A checked plant. `trusted`: are its sensors taken as correct in a diagnosis?"""
 
     title: str
     inputs: Mapping[str, Input]

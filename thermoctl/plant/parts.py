@@ -15,11 +15,11 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
-ALARM = 1e-6  # false alarms a recording, of intervals that are random
-MISSED = 4.5  # intervals of a regular recording from which samples are missing
-REGULAR = 0.1  # share of its median by which the intervals of a regular recording differ
-FEW = 8  # samples of which nothing can be stated
-MANY = 50  # more gaps than one in so many samples are the logger's way of sampling
+ALARM = 1e-6  # probability of a false alarm in a recording with random intervals
+MISSED = 4.5  # in a regular recording, an interval of so many usual ones lacks samples
+REGULAR = 0.1  # a recording is regular if its intervals differ by at most this share of their median
+FEW = 8  # with fewer samples no gap is sought
+MANY = 50  # gaps that are more frequent than one in so many samples belong to the logger's sampling
 HOUR_S = 3600.0
 RESTARTED = "restarted"
 """Key of a part's `meta`: its start comes from its readings."""
@@ -116,7 +116,7 @@ def unread_starts(plant: Plant) -> list[str]:
 
 
 def _goes_on(plant: Plant, table: Table, k: int) -> bool:
-    """Return whether readings that move go on behind a gap as if no time had passed."""
+    """Return whether moving readings continue after a gap as if no time had passed."""
     usual = float(np.median(np.diff(table.t)))
     steady = []
     for o in plant.outputs.values():

@@ -223,7 +223,7 @@ def in_plant_units(plant: Plant, table: Table) -> Table:
 
 
 def as_recorded(plant: Plant, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return columns in the plant's units as a file holds them that the plant shall read again."""
+    """Return columns in the plant's units, converted back to the units in which the plant reads a file."""
     found = dict(columns)
     for item in plant.readings():
         if item.conversion and item.column in found:

@@ -1,4 +1,4 @@
-"""When recordings began, and how a quantity that each of them gives changes over these dates."""
+"""Dates of recordings, and the trend over these dates of a quantity that each recording gives."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from thermoctl.recording.table import Table
 
 MONTH_S = 30 * 86400.0
-FEWEST = 3  # sizes whose scatter about a line can be computed
+FEWEST = 3  # least number of sizes to compute their scatter about a line
 
 
 def line(times_s: Sequence[float], sizes: Sequence[tuple[float, float]]) -> tuple[float, float]:

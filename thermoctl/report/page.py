@@ -85,7 +85,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], caption: str = 
 
 
 def cell(v: object) -> str:
-    """Return a number or a word as HTML: 4 significant digits, thousands apart, powers of ten as such."""
+    """Return a number or a word as HTML: 4 significant digits, separated thousands, powers of ten."""
     if v is None or (isinstance(v, float) and math.isnan(v)):
         return "–"
     if not isinstance(v, float):

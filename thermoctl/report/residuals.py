@@ -1,4 +1,4 @@
-"""Are residuals white? Autocorrelation and cumulated periodogram, with the bounds of white noise."""
+"""Tests for white residuals: autocorrelation and cumulated periodogram, with the bounds of white noise."""
 
 from __future__ import annotations
 

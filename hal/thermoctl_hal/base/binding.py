@@ -30,7 +30,7 @@ class Bound:
 
 
 def limits_of(channel: Channel) -> tuple[float, float]:
-    """Return the range of a channel's readings; without one, all that are no 9.9E37 of SCPI."""
+    """Return the range of a channel's readings; by default all below 9.9E37, SCPI's "no reading"."""
     most = NO_VALUE * abs(channel.scale)
     low, high = (max(-most, min(most, v)) if math.isinf(v) else v for v in channel.range)
     return low, high
@@ -48,12 +48,13 @@ class Binding:
     place: str
     channels: Channels = DEFAULT
     shared: bool = False  # are other devices of this rig on the same port?
-    neighbours: tuple[Binding, ...] = ()  # the other devices of the port
-    axis: str = ""  # whose amplifier it is; empty on a rig without axes, and for devices of several axes
+    neighbours: tuple[Binding, ...] = ()  # other devices on the same port
+    # The axis whose amplifier the device is; empty on a rig without axes, and for devices of several axes.
+    axis: str = ""
 
 
 def port_key(port: str) -> str:
-    """Return what a port opens: the path without interface and bitrate, links followed; or its address."""
+    """Return a key of a port: its real path without interface and bitrate, or its address."""
     if not port.startswith(EXCLUSIVE) or NETWORK in port:
         return re.sub(r"@\d+(,\d+)?$", "", port).removeprefix("rtu:")
     return os.path.realpath(re.sub(r"^(slcan|rtu):|@\d+(,\d+)?$", "", port))

@@ -24,7 +24,7 @@ from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.base.profile import FIELD_TYPES, Object
 
 MAX_STEP_S = 0.01  # longest time for which a position target moves in one write
-FAULT_RESET_S = 1.0  # between attempts to reset a drive's fault while `enable` is False
+FAULT_RESET_S = 1.0  # time between attempts to reset a drive's fault while `enable` is False
 CONTROL_WORD = Object(0x6040)
 MAX_SUB_INDEX = 255
 OBJECT_TYPES = {t: c for t, c in FIELD_TYPES.items() if t[-2:] != "64" and not t.startswith("float")}

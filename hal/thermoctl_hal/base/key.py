@@ -32,7 +32,7 @@ class Key:
 
 
 def bits_of(of: str) -> tuple[Key, ...]:
-    """Return the keys of a value that is some bits of another one."""
+    """Return the keys of a value that consists of some bits of another value."""
     return (
         Key("low_bit", "integer", f"lowest bit of the value inside {of}", 0, "", 0, 63, example="4"),
         Key("bits", "integer", f"number of bits of the value; 0: all of {of}", 0, "", 0, 64, example="19"),

@@ -22,11 +22,11 @@ from thermoctl_hal.base.profile import LineSettings
 NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter
 MAX_LINE = 1024  # a text line longer than this is garbage
-_CHARACTERS = 6  # place of the special characters in termios' list
+_CHARACTERS = 6  # index of the special characters in termios' list
 
 
 class LineReader:
-    """Bytes in, lines out; a line that is too long is dropped up to its end.
+    """Divides received bytes into lines; a line that is too long is dropped up to its end.
 
     end: the bytes that end a line; empty: CR, LF or both."""
 
@@ -91,11 +91,12 @@ def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
         set_latency_timer(path, line.latency_timer_ms)
     try:
         settings = termios.tcgetattr(port.fileno())
-        settings[_CHARACTERS][termios.VMIN] = 1  # 'nothing yet' is EAGAIN, so that no bytes mean 'gone'
+        # Without data, a read raises EAGAIN: an empty result means that the port is gone.
+        settings[_CHARACTERS][termios.VMIN] = 1
         termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
         termios.tcflush(port.fileno(), termios.TCIOFLUSH)
         os.set_blocking(port.fileno(), False)
-    except (OSError, termios.error) as e:  # unplugged meanwhile; termios.error is no OSError
+    except (OSError, termios.error) as e:  # unplugged meanwhile; termios.error is not an OSError
         port.close()
         raise HardwareError(f"{path}: gone while it was opened ({e})") from None
     return port

@@ -1,4 +1,4 @@
-"""Files that devices are described by: read again only after a change, in the encodings that programs use."""
+"""Files that describe devices: parsed again only after a change, in the encodings that programs write."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 KEPT = 32  # files of each kind
 
 _MARKS = (
-    (codecs.BOM_UTF32_LE, "utf-32"),  # begins as that of UTF-16
+    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose mark begins in the same way
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),
@@ -32,7 +32,7 @@ def while_same(read: Callable[[Path], T]) -> Callable[[Path], T]:
         try:
             content = path.read_bytes()
         except OSError:
-            return read(path)  # raises its own error
+            return read(path)  # `read` raises its own error
         return kept(path, content)
 
     return call

@@ -45,7 +45,7 @@ def role_units(role: str) -> dict[str, tuple[float, float]]:
 
 
 def dbc_unit(text: str | None) -> str:
-    """Return the unit of a DBC file in our spelling; a unit that is not known as it stands."""
+    """Return the unit of a DBC file in our spelling; an unknown unit is returned as it is."""
     plain = (
         unicodedata.normalize("NFKC", (text or "").replace("º", "°").replace("ᵒ", "°"))
         .replace("Â", "")
@@ -65,5 +65,5 @@ def dbc_unit(text: str | None) -> str:
 
 
 def is_convertible(unit: str) -> bool:
-    """Return whether it is a unit that we know, so that another one means other numbers."""
+    """Return whether a unit is known, so that readings in another unit can be converted."""
     return unit in _SPELLINGS or unit in _PREFIXED or any(unit in u for u in _UNITS.values() if len(u) > 1)

@@ -11,11 +11,12 @@ A port is written "interface:channel@bitrate,second"; the default bitrate is 100
                                   `second` is the data bitrate of CAN FD; without it the bus is classic
 
 Identifiers of 29 bits carry the bit EXTENDED everywhere, so that they never match an 11-bit one of the same
-number. A device may want a parameter group of J1939 instead, BY_PGN | its number: from any source address, at
-any priority. Remote frames and error frames are counted and otherwise ignored. CAN FD frames come apart, by
-`long_frames`: a device that does not expect them never sees them.
+number. A device may want a parameter group of J1939 instead. It then gives BY_PGN | number of the group, and
+gets its frames from any source address, at any priority. Remote frames and error frames are counted and
+otherwise ignored. CAN FD frames are returned separately, by `long_frames`, so that a device which does not
+expect them never sees them.
 
-Bus-off: the kernel's error frames and those of gs_usb tell it, PCAN raises an error, IXXAT reports a state
+Bus-off: the kernel and gs_usb send error frames, PCAN raises an error, IXXAT reports a state
 (`can.BusState.ERROR`). An slcan adapter has no message for it.
 """
 
@@ -51,7 +52,7 @@ _SLCAN_BITRATES = {
 }
 SLCAN_BAUD = 3_000_000
 SHARED = ("socketcan", "virtual", "udp_multicast")  # any number of programs and devices may open these
-KERNEL_ERRORS = ("gs_usb", "socketcan", "socketcand")  # whose error frames are those of the kernel
+KERNEL_ERRORS = ("gs_usb", "socketcan", "socketcand")  # interfaces with the kernel's error frames
 NEVER_BLOCK = ("virtual", "udp_multicast")  # interfaces whose recv(0) returns at once
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
 _FD_FRAME = struct.Struct("=IB3x64s")  # struct canfd_frame
@@ -307,7 +308,7 @@ class LibraryPort(CanPort):
 
 
 def _says_bus_off(error: Exception) -> bool:
-    """Return whether an interface's error tells of bus-off, by its words or its name."""
+    """Return whether an interface's error means bus-off, by its text or its name."""
     return bool(re.search(r"bus[\s_-]?off", f"{type(error).__name__} {error}", re.IGNORECASE))
 
 

@@ -35,7 +35,8 @@ class DbcDevice(Device):
         self._sender: dict[int, int] = {}  # parameter group -> the source address that it is taken from
         self._fd_ignored = 0
         self._others: set[int] = set()  # source addresses of J1939 whose messages were not taken
-        self._quiet, self._why = 0, ""  # frames since the last reading, and why the last of them gave none
+        # Number of frames since the last reading; why the newest of them gave no reading.
+        self._quiet, self._why = 0, ""
         for i, b in enumerate(binding.bounds):
             if isinstance(b.channel.source, Assumed):
                 continue
@@ -77,9 +78,10 @@ class DbcDevice(Device):
                 self._fd_ignored += 1
 
     def _entry(self, can_id: int) -> _Entry | None:
-        """Return the message of an identifier, or of its parameter group from one sender, the first one.
+        """Return the message of an identifier, or of its parameter group.
 
-        A second sender of the group is another device: the binding's `address` chooses."""
+        A group is taken from its first sender only. A second sender is another device; `address` of the
+        binding selects it."""
         entry = self._messages.get(can_id)
         group = pgn_of(can_id)
         if entry is not None or group not in self._messages:

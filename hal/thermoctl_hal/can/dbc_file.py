@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Database, Message
 
 EXTENDED, LONGEST_11, LONGEST_29 = 0x8000_0000, 0x7FF, 0x1FFF_FFFF
-NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"  # holds the signals that no message has
+NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"  # pseudo-message that holds signals without a message
 _BLOCK = re.compile(r"\s*BO_\s+(0[xX][0-9A-Fa-f]+|\d+)\s+([^\s:][^:]*?)\s*:\s*(\d+)\s*(\S*)")
 _BEGINS_BLOCK = re.compile(r"\s*BO_\s")
 _TEXT = re.compile(r"\s*(?:CM_|BA_\w*)\s")  # statements whose text may go on over several lines
@@ -34,7 +34,7 @@ _SIGNAL = re.compile(
 _BEGINS_SIGNAL = re.compile(r"\s*SG_\s+([^\s:]+)")
 _NAME = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"[+-]?(?:\d+[.]?\d*|[.]\d+)(?:[eE][+-]?\d+)?")
-_PLAIN = re.compile(r"\s*[+-]?\d[^,;]*,\s*[+-]?\d[^,;]*")  # as the format has it
+_PLAIN = re.compile(r"\s*[+-]?\d[^,;]*,\s*[+-]?\d[^,;]*")  # a scale as the format prescribes
 _TYPE = re.compile(r"\s*SIG_VALTYPE_\s+(\d+)\s+(\S+?)\s*:?\s*([0-3])\s*;")
 _EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
 _FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
@@ -282,7 +282,7 @@ def _scale(text: str) -> str:
 def _parsed(
     block: _Block, number: int, name: str, signals: Sequence[_Signal], attributes: list[str]
 ) -> tuple[Message | None, str]:
-    """Return the message by cantools and what its strict reading says against it; None where it has none."""
+    """Return the message by cantools, and the fault that its strict mode finds; None where it reads none."""
     from cantools.database import load_string
 
     back = {s.name: s.safe for s in signals}

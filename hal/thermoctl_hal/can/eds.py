@@ -29,7 +29,7 @@ class Entry:
     """A section of the file: its line, and the keys that count, by lower-case name."""
 
     line: int
-    again: Entry | None = None  # a second section of this object with another type
+    again: Entry | None = None  # another section of the same object, with another type
     keys: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -87,7 +87,7 @@ def read_eds(path: Path) -> Eds:
 
 
 def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, str]]]:
-    """Return the objects' sections, and what was passed over: line and words."""
+    """Return the objects' sections, and what was passed over: (line, description)."""
     entries: dict[Object, Entry] = {}
     remarks: list[tuple[int, str]] = []
     counts: dict[int, int] = {}  # index -> line of its sub-index 0

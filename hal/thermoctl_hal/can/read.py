@@ -26,7 +26,8 @@ from thermoctl_hal.can.keys import CAN
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Signal
 
-NEAR_RAW = 0.01  # a value is that of a raw number when it lies so close to it, in steps
+# A value belongs to a raw number if it is this close to the number's value, in steps of the signal.
+NEAR_RAW = 0.01
 
 
 def read_dbc(top: Section, folder: Path) -> Dbc:

@@ -31,7 +31,7 @@ PDO_BYTES = 8
 LISTEN_S, LISTEN_BEATS = 0.1, 5
 """Time to listen for a foreign heartbeat before anything is sent: at least LISTEN_S, and LISTEN_BEATS
 periods."""
-DOUBLE_ANSWERS = 3  # this many second answers to a request prove that two devices share the node id
+DOUBLE_ANSWERS = 3  # number of double answers to requests that prove that two devices share the node id
 _FORMATS = {0x01: "B", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
 """Data types of CiA 301 (BOOLEAN, INTEGER8 .. 32, UNSIGNED8 .. 32) and their letters in `struct`."""
 

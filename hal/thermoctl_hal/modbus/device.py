@@ -52,16 +52,17 @@ EXCEPTIONS = {
     ),
 }
 """Modbus exception codes: the text, and what to do."""
-BUSY, PASSING = (5, 6), (5, 6, 10, 11)  # requests repeated at once; never an ERROR of the channel itself
+# Exceptions of a busy unit; those after which a request is repeated, without an ERROR.
+BUSY, PASSING = (5, 6), (5, 6, 10, 11)
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 ILLEGAL_FUNCTION = 1
 NOT_OF_A_REGISTER = (ILLEGAL_FUNCTION, *PASSING)
 """Exceptions that no register can cause; after any other the block is read one by one."""
 MAX_EXPONENT = 10  # largest value of a scale register: SunSpec allows -10 .. 10, and -32768 for none
-MUTE_POLLS = 2  # lost answers, after which a block that never came is asked for without its gaps
+MUTE_POLLS = 2  # after so many lost answers, a block that never was answered is requested without its gaps
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.02
-LOST_POLLS = 3  # polls without any answer, after which the link is opened again
-MAX_BITS = 2000  # coils of one answer
+LOST_POLLS = 3  # after so many polls without any answer the link is opened again
+MAX_BITS = 2000  # largest number of coils in one answer
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def plan_blocks(registers: Iterable[tuple[int, Register]], max_gap: int, max_blo
 
 
 def decode(words: Sequence[int], register: Register) -> float:
-    """Return the raw number in `words` (uint16 in the order of the wire; bits 0 or 1); NaN for no BCD."""
+    """Return the raw number in `words` (uint16 in the order of the wire, or bits); NaN for invalid BCD."""
     if register.type == "bit":
         return float(words[0])
     ordered = words if register.word_order == "big" else words[::-1]
@@ -139,7 +140,8 @@ class ModbusDevice(Device):
         self._got: list[tuple[int, float, float]] = []  # readings of this poll: (item, raw number, time)
         self._plan()
         self._lost_polls = 0
-        self._heard: set[tuple[str, int, int]] = set()  # kind, address and count of the blocks that came
+        # (kind, address, count) of the blocks that were answered at least once.
+        self._heard: set[tuple[str, int, int]] = set()
 
     def _plan(self) -> None:
         registers = [(k, register) for k, (_, register, _) in enumerate(self._items)]

@@ -38,7 +38,8 @@ FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 BITS = ("coil", "discrete")
 WRITE_COIL, WRITE_SEVERAL = 5, 16
 REFUSAL = 0x80  # bit of the function code of an exception
-MIN_RTU, SHOWN = 4, 12  # bytes: the shortest RTU frame; the first bytes of a bad answer in a message
+# Bytes of the shortest RTU frame; number of bytes of a bad answer that a message shows.
+MIN_RTU, SHOWN = 4, 12
 HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
@@ -81,7 +82,7 @@ class Link:
         self._transaction = 0
         self._echoes = False  # does the line send our own bytes back?
         self._answered = False
-        self._free_s = 0.0  # an RTU frame may begin from then on
+        self._free_s = 0.0  # time from which the next RTU frame may begin
         self._is_rtu = port.startswith("rtu:")
         messages, framers = (load(f"pymodbus.{name}", port) for name in ("pdu", "framer"))
         self._invalid = load("pymodbus", port).ModbusException
@@ -175,7 +176,7 @@ class Link:
             return answer
 
     def _ask_again(self, message: Any, timeout_s: float) -> bytes:
-        """Ask; again over a new connection where a server that has answered before closed this one."""
+        """Return the answer. If a server that answered before closes the connection, ask over a new one."""
         for left in reversed(range(ATTEMPTS)):
             try:
                 return self._ask_once(message, timeout_s)
@@ -255,7 +256,7 @@ class Link:
         return None
 
     def _why(self, data: bytes, request: _Request, timeout_s: float) -> str:
-        """Say what came instead of the answer, and which key cures it."""
+        """Say what came instead of the answer, and which key of the profile may be wrong."""
         if self._is_rtu and data.startswith(request.frame):
             data = data[len(request.frame) :]
             if not data:

@@ -57,7 +57,7 @@ class Board:
         path.unlink(missing_ok=True)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
-            os.posix_fallocate(fd, 0, size)  # where memory is lacking: an error now, no SIGBUS later
+            os.posix_fallocate(fd, 0, size)  # reserve the memory now: an error here instead of SIGBUS later
             return cls(mmap.mmap(fd, size), path, True)
         finally:
             os.close(fd)
@@ -92,7 +92,7 @@ class Board:
     def post(self, sample: Sample, device: Device) -> None:
         """Write the device's rows from `sample`; only the one writer of the device may call it."""
         first = device.roles[0]
-        writing = int(self._sequence[first]) | 1  # also after a writer that was killed while it wrote
+        writing = int(self._sequence[first]) | 1  # odd, also if the last writer was killed while it wrote
         self._sequence[first] = writing
         for role in device.roles:
             row = self.rows[role]

@@ -89,7 +89,7 @@ def slow_devices(settings: Settings) -> list[Device]:
 
 
 def disable_amplifier(settings: Settings) -> None:
-    """Disable the amplifier of `hal.devices` over a link of its own: for when the loop can no longer do it.
+    """Disable the amplifier of `hal.devices` over a link of its own, if the loop no longer can.
 
     No other device is opened, and a mistake in another device's profile does not count. Raises HardwareError,
     OSError, InputError."""
@@ -127,7 +127,7 @@ def device_warnings(settings: Settings) -> list[str]:
 
 
 def whole_frames(settings: Settings) -> dict[str, str]:
-    """Return role -> device, for devices of which each frame (or line) has every channel."""
+    """Return role -> device, for devices that send all their channels in each frame or line."""
     return {
         x.role: b.name
         for b in _bindings(settings)

@@ -10,7 +10,7 @@ import re
 
 BASES = (10, 16)
 DECIMALS = (".", ",")
-_SHOWN = 60  # characters of a line in a message
+_SHOWN = 60  # largest number of characters of a line in a message
 _NUMBER = {
     (10, "."): re.compile(r"([-+]?) *(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?)$", re.ASCII),
     (10, ","): re.compile(r"([-+]?) *(\d+,?\d*(?:[eE][-+]?\d+)?|,\d+(?:[eE][-+]?\d+)?)$", re.ASCII),

@@ -113,7 +113,7 @@ class PlantRig:
         self.y = self.stepper.step(self.u)
         self.index = _roles_of_outputs(
             path, model.outputs, roles, channels.names
-        )  # after the outputs come the surroundings
+        )  # sensors of the surroundings have the numbers after the outputs
         outputs = [plant.outputs[n] for n in model.outputs]
         self._noise = [o.noise.white if isinstance(o.noise, SensorNoise) else o.noise or 0.0 for o in outputs]
         self._noise += [s.noise for _, s in self._surroundings]

@@ -1,4 +1,4 @@
-"""The plants of a rig's axes, read as one: a role is AXIS.CHANNEL; a shared role is the first axis'."""
+"""The plants of a rig's axes, read as one. A role is AXIS.CHANNEL; a shared role is the first axis's."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ A computed signal may have ABSENT channels: the law does without them.
 
 
 def sources(channels: Channels) -> dict[str, tuple[str, ...]]:
-    """Return the same for all signals of a rig with these channels."""
+    """Return, by signal, the channels that it is computed from, for a rig with these channels."""
     return {
         **FIXED_SOURCES,
         **{role: (role,) for role in channels.temperatures},

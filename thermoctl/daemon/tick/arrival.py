@@ -1,4 +1,4 @@
-"""How many readings a second arrive, against `rate_hz` of the devices' profiles; counters of the devices.
+"""Compare the rate of arriving readings with `rate_hz` of the devices' profiles; counters of the devices.
 
 A sensor that sends at a tenth of its rate passes every age limit that suits a slow machine. But its readings
 are older than the control loop and the limits on jumps assume. So `doctor` and `status` compare both rates.

@@ -109,7 +109,7 @@ class Watch:
         self._position = self._captured = self._inode = 0
         self._bits: int | None = None  # fault bits of the row before; None before the first
         self._moved_s = time.monotonic()
-        self._is_new = True  # no daemon was seen yet: `past` is then that of the recording
+        self._is_new = True  # no daemon has been seen yet, so that `past` comes from the recording
         model = compensator(settings)
         self._noise_c2 = model.R_v if settings.compensation.model else math.nan
         self._gain = float(model.C[0] @ model.gain[:, 0])

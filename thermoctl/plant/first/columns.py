@@ -58,7 +58,7 @@ _STEMS = {
     "duty": "duty pwm tastgrad percent",
     "power": "power leistung puissance potenza potencia vermogen effekt watt",
 }
-_DEVICES = {  # a name of the thing alone: the pump's power is a power
+_DEVICES = {  # names of devices; they count only if no other kind fits: "pump power" is a power
     "flow": "pump pompe pompa bomba",
     "position": "encoder",
     "power": "heat heiz chauff chaleur riscald calef calor aquec verwarm varme grzej grzan grzal warme waerme boiler "
@@ -80,7 +80,7 @@ _WORDS = {
     "power": "p q pel moc power",
 }
 _SHARES = {1.0: "1", 100.0: "%"}  # ends of a duty's scale, and the unit
-_AIR = (  # the surroundings, furthest out first: the room of a building is a body
+_AIR = (  # names of surroundings, the outermost first: the room of a building is a body, the weather is not
     "outside outdoor outdoors exterior extern esterno esterna externo externa exterieur exterieure dehors aussen "
     "buiten ute utomhus zewnatrz venkovni weather wetter",
     "amb ambient ambiant ambiante ambiental ambientale ambiente env environment surroundings umgebung umg omgeving "

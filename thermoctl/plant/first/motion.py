@@ -129,7 +129,7 @@ def _sizes(
     travel = max(
         float(np.ptp(place if place is not None else integral(speed if speed is not None else force))), 1e-12
     )
-    if not mass > 0:  # nothing of the kind in the data: the order of magnitude
+    if not mass > 0:  # the data do not give it: use the order of magnitude
         mass = max(float(np.ptp(force)), 1e-9) * float(time[-1]) ** 2 / travel / 100
     if not damping > 0:
         damping = mass / float(time[-1])

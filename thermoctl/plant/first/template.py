@@ -27,8 +27,8 @@ _PLACES = (
     "bed bett heizbett druckbett plate lit letto cama",
 )
 _FAN = 5
-SAME = 1.5  # score beyond which a name says that it is the same place
-_MOST = 7  # columns of one kind that are tried in every order
+SAME = 1.5  # least score at which two names mean the same place
+_MOST = 7  # up to so many columns of one kind are tried in every order
 
 
 def text(name: str) -> str:
@@ -132,7 +132,7 @@ def _fits(c: Column, kind: str, ambient: bool) -> bool:
 
 
 def _shared(c: Column | None, bodies: Sequence[set[str]]) -> float:
-    """Return a part of a score for the words that a column shares with those of bodies."""
+    """Return the part of a column's score for words that its name shares with the names of bodies."""
     return 0.2 * max((len(set(words(c.name)) & b) for b in bodies), default=0) if c else 0.0
 
 
@@ -141,7 +141,7 @@ def _is_fan(name: str) -> bool:
 
 
 def _score(item: Input | Output, c: Column | None) -> float:
-    """Return how well a column's name fits an item's: a place in common, a word, none."""
+    """Return a score of how well a column's name fits an item's name: same place, same word, neither."""
     if c is None:
         return 0.0
     own, its = set(words(item.name)), words(c.name)
@@ -159,7 +159,7 @@ def _score(item: Input | Output, c: Column | None) -> float:
 
 
 def _with_column(content: str, item: Input | Output, c: Column, chosen: bool) -> str:
-    """Return the text with `column` in an item's line, and what is to be confirmed in its comment."""
+    """Return the text with `column` in an item's line, and `# confirm` with the guess as its comment."""
     match = _line(content, item.name)
     odd = bool(c.unit) and not c.stated and c.unit != item.unit
     column = f"{{name: {quoted(c.name)}, unit: {quoted(c.unit)}}}" if odd else quoted(c.name)

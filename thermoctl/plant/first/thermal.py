@@ -21,8 +21,8 @@ from thermoctl.plant.first.columns import Column, identifiers, noise, words
 from thermoctl.recording.table import Table
 
 MARGIN = 5.0  # the ranges of a first guess reach from value / MARGIN to value * MARGIN
-UNKNOWN_SCALE = 200.0  # and so much further where the heat is known up to a factor that the user has to write
-ABSENT = 1e-5  # least conductance as a share of the guess: as good as none, for links that do not exist
+UNKNOWN_SCALE = 200.0  # factor by which the ranges are wider if the user has to write the scale of the heat
+ABSENT = 1e-5  # lower end of a link's conductance over the guess, nearly 0, because the link may not exist
 FEW_BODIES = 3  # with more bodies only neighbours get a link, not every pair
 FULL = {1.0: "", 100.0: " / 100", 255.0: " / 255"}  # ends of a duty's scale, and what divides it
 
@@ -196,7 +196,7 @@ def _sizes(
 
 
 def _heated(t: np.ndarray, heat: _Heat, sensors: Mapping[str, np.ndarray], ids: Mapping[str, str]) -> str:
-    """Return the sensor that shares most words with the heat's name, else the one that follows it most.
+    """Return the sensor whose name shares most words with the heat's, else the one that correlates best.
 
     `ids`: name in the plant by column."""
     own = set(words(heat.column.name))

@@ -3,10 +3,11 @@
     (H + l D) v = g,    (H + l D) a = J' d2r/dh2 along v,    z <- z + v + a/2,    D = diag H
     g: the height's gradient,  H: minus its second derivative (Gauss-Newton),  r: residuals,  J = -dr/dz
 
-The damping l follows the success of the steps. The valleys of a misfit are curved, and a straight step leaves
-them: half the geodesic acceleration a follows (Transtrum & Sethna 2012, arXiv:1201.5885). A coordinate that
-meets its bound is held there until the gradient leads back inside. A climb ends where a step without damping
-promises next to nothing, not where a step gained little: a damped step may.
+The damping l is lowered after a good step and raised after a failure. The valleys of a misfit are curved,
+and a straight step leaves them. So half the geodesic acceleration a is added (Transtrum & Sethna 2012,
+arXiv:1201.5885). A coordinate that meets its bound is held there until the gradient leads back inside. A
+climb ends where a step without damping promises less than a limit. A small gain of a damped step does not
+end it.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ import numpy as np
 
 from thermoctl.plant.simulation.simulate import SimulationError
 
-FIRST, LEAST, MOST = 1e-3, 1e-9, 1e8  # damping: the first, and its limits
+FIRST, LEAST, MOST = 1e-3, 1e-9, 1e8  # first, least and largest damping
 EASED, RAISED = 0.2, 8.0  # factor on the damping after a step that gains half of its promise; after a failure
-TRIES = 12  # dampings that are tried for one step
-STRAIGHT = 0.75  # share of its promise that a step gains, from which the next one is not bent
+TRIES = 12  # largest number of dampings that are tried for one step
+STRAIGHT = 0.75  # after a step that gains this share of its promise, the next one is not bent
 CURVED = 0.75  # largest acceleration, as a share of the step
 SLOW = 20.0  # a step is slow if more than this many such steps are needed
 SLOW_STEPS = 3  # end after so many slow steps in a row
@@ -50,7 +51,7 @@ class Hill(Protocol[T]):
 
     @property
     def few(self) -> bool:
-        """Does a look with slopes at once cost less than one without, and another with them?"""
+        """Is one evaluation with slopes cheaper than one without, followed by one with them?"""
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[T]:
         """Return the height at z; with `slopes` they are computed, too."""

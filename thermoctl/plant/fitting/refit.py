@@ -20,11 +20,9 @@ from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationErr
 AT_BOUND = 1e-6  # a parameter counts as at its bound within this share of its range
 MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations
 KEPT_STARTS = 2  # number of random starts that are refined
-PREVIEW = (
-    12  # iterations of a further start; it continues if its sum of squares is below PREVIEW_SHARE of the best
-)
+PREVIEW = 12  # iterations of a further start before its cost is compared with PREVIEW_SHARE of the best
 PREVIEW_SHARE = 0.98
-RELIMITS = 4  # number of times that the outlier limits are set anew
+RELIMITS = 4  # largest number of times that the outlier limits are updated
 
 
 @dataclass
@@ -148,7 +146,7 @@ def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> l
 
 
 def _follow(problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None) -> Fit | None:
-    """Descend from a start, setting the outlier limits anew; None if it is soon not below `best`."""
+    """Descend from a start, updating the outlier limits; None if it does not soon come below `best`."""
     problem.set_outlier_limits(problem.evaluate(z, False).residuals)
     if best is not None:
         z = _descend(problem, z, dataclasses.replace(limits, iterations=PREVIEW)).z
@@ -173,7 +171,7 @@ def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
     )
 
 
-Found = tuple[Evaluation, list[ResidualRows] | None]  # rows only where slopes were computed
+Found = tuple[Evaluation, list[ResidualRows] | None]  # an evaluation, and its rows if slopes were computed
 
 
 class _Misfit:

@@ -127,7 +127,8 @@ class Code(Equations):
         ]
 
 
-# ------------------------------------------------------------------------------------------------------ loading
+# ------------------------------------------------------------------------------------------------------
+# loading
 
 
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
@@ -145,7 +146,7 @@ def _typed(library: ctypes.CDLL) -> ctypes.CDLL:
 
 
 def machine_code(plant: Plant, active: tuple[str, ...], stepper: bool = False) -> Code:
-    """Return the plant's machine code with sensitivities to `active`; plants of one structure share it.
+    """Return a plant's machine code with sensitivities to `active`. Plants of one structure share it.
 
     `stepper`: with the functions that advance by one period, which take a fifth of the compiler's time."""
     identity = hashlib.sha256(repr((active, stepper, _structure(plant))).encode()).hexdigest()

@@ -29,13 +29,13 @@ KINDS = {
     "unit": 35,
     "bare": 0,
 }
-STEP = 50  # points of an interval that the file states
+STEP = 50  # points for a column that has the interval stated in the file
 # Points for a name of times, for a name of a counter, for a unit that is not one of time.
 NAMED, COUNTED, FOREIGN = 30, -30, -60
 STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
-NEEDED = 30  # points from which a column is a clock
-SURE = 60  # points from which a clock stands, though another column holds wrong dates
-COUNTER = 1.0  # step of a counter
+NEEDED = 30  # least points of a clock
+SURE = 60  # least points of a clock that is used even if another column holds wrong dates
+COUNTER = 1.0  # step of a column that counts rows
 MILLI = 1000
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
@@ -135,7 +135,7 @@ def unit_of_time(name: str, unit: str | None) -> str | None:
 
 
 def _run(t: np.ndarray) -> tuple[int, str]:
-    """Return points for how a clock runs, and the words for it."""
+    """Return points for how evenly a clock increases, and the reason as text."""
     t = t[np.isfinite(t)]
     steps = np.diff(t)
     if not len(steps):
@@ -271,7 +271,7 @@ def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: 
 
 
 def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
-    """Yield dates with a column of times of day, of either with a column of milliseconds."""
+    """Yield clocks of two columns: dates and times of day, or either of them and milliseconds."""
     names = list(sheet.columns)
     dates = [n for n, s in read.items() if s.kind == "date"]
     full = [n for n, s in read.items() if s.kind in ("date and time", "time of day")]
@@ -405,7 +405,7 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
 
 
 def _says_it(clock: Clock, stated: Clock) -> bool:
-    """Return whether a column of times holds what the file states of its interval."""
+    """Return whether a column of times has the interval that the file states."""
     t, other = clock.seconds.t, stated.seconds.t
     same = len(t) == len(other) and np.allclose(t - t[0], other - other[0], rtol=1e-6, atol=0.0)
     return bool(same) and not clock.counter
@@ -416,7 +416,7 @@ def _stem(name: str) -> str:
 
 
 def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:
-    """Return clocks of the same name, but for a number, that run otherwise and have columns of their own."""
+    """Return other clocks whose names differ only by a number, and whose times and columns differ."""
     names = list(sheet.columns)
     taken = set(best.columns)
     found: list[Clock] = []

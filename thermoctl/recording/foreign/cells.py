@@ -31,7 +31,7 @@ _READINGS = {
     ".": rf"^(\d+|[1-9]\d{{0,2}}(,\d{{3}})+|[1-9]\d{{0,2}}([{_GROUP}]\d{{3}})+)?(\.\d*)?$",
     ",": rf"^(\d+|[1-9]\d{{0,2}}(\.\d{{3}})+|[1-9]\d{{0,2}}([{_GROUP}]\d{{3}})+)?(,\d*)?$",
 }
-FEW_WORDS = 3  # different words among numbers that are a status, not remarks
+FEW_WORDS = 3  # up to so many different words among numbers are a status; more are remarks
 
 
 @dataclass(frozen=True)

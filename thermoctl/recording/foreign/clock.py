@@ -77,8 +77,8 @@ EPOCHS = (
     ("millionths of a day since 1900 (WinCC)", DAY_S / 1e6, _1899, 3.6e10, 7.3e10),
     ("Julian days", DAY_S, -2_440_587.5 * DAY_S, 2_451_544.0, 2_488_070.0),
 )
-YEARS = 20, 39  # two digits that are a year rather than a day
-LONG = 1e8  # counts of an epoch that hardly any signal has
+YEARS = 20, 39  # range of two digits that are a year rather than a day
+LONG = 1e8  # least count since an epoch: hardly any signal has so large numbers
 
 
 class ClockError(Exception):

@@ -21,11 +21,11 @@ from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
 from thermoctl.units import SECONDS
 
-SAMPLE = 400  # lines that decide
+SAMPLE = 400  # number of first lines from which the dialect is found
 FEW = 5  # in a file with more lines, the head takes at most half of them
 SEPARATORS = (",", ";", "\t", "|", "  ", " ")
 HEAD_LINES = 6  # number of lines above the data from which names, units and kinds of values are taken
-UNIT_LENGTH = 16  # characters of a cell in a line of units
+UNIT_LENGTH = 16  # largest number of characters of a cell in a line of units
 _COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|NUM|REF|BEZUG|NULL)!))")
 # The line below the header of a table in Markdown or SQL.
 _RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")
@@ -184,7 +184,7 @@ def _separator(
     best: tuple[float, str, list[tuple[int, list[str]]]] | None = None
     for separator in candidates:
         if not separator.strip(" ") and best is not None and best[0] >= 0.3:  # noqa: PLR2004
-            break  # blanks inside the cells of another separator
+            break  # blanks inside the cells: another separator was found already
         try:
             rows = [(n, cells_of(line, separator)) for n, line in sample]
         except csv.Error:

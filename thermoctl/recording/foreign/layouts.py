@@ -1,4 +1,4 @@
-"""Texts that are no plain table: long tables, JSON, InfluxDB, Klipper's log, Tektronix.
+"""Read texts that are not a plain table: long tables, JSON, InfluxDB, Klipper's log, Tektronix.
 
 Each reader returns sheets of texts, or None where the text is of another kind.
 """
@@ -33,7 +33,7 @@ _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
-LEAD = 65536  # bytes that decide
+LEAD = 65536  # number of first bytes from which the layout is found
 _GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
 
 

@@ -1,7 +1,7 @@
 """Read the recording of any logger: text of every dialect, Excel, MATLAB, MDF, TDMS, Parquet, JSON.
 
-Our own files take the way of `read_table`: same speed, same errors. Every other file becomes sheets of
-cells. The whole column decides on the kind of its cells, and evidence decides which column is the time.
+Files of this program are read by `read_table`, with its speed and its errors. Every other file becomes sheets
+of cells. The whole column decides on the kind of its cells, and evidence decides which column is the time.
 Every guess is a note of the table; nothing is repaired silently.
 """
 
@@ -45,7 +45,7 @@ from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import split_unit, split_words
 from thermoctl.recording.table import Table
 
-HEAD = 65536  # bytes that decide whether a file is one of ours
+HEAD = 65536  # number of first bytes that show whether this program wrote the file
 HOUR_S = 3600.0
 EQUAL_TIMES = ("spread", "mean", "first", "last")
 MAGIC = (
@@ -126,7 +126,7 @@ _TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", "")
 
 
 def options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return what the options of a command say about its recordings, for `read_recording`."""
+    """Return the options of a command about reading its recordings, as arguments of `read_recording`."""
     missing = next(csv.reader(io.StringIO(getattr(args, "missing", None) or "")), [])
     return {
         "time": args.time,
@@ -153,7 +153,7 @@ def print_notes(tables: Iterable[Table]) -> None:
 def _is_ours(path: Path, how: How) -> bool:
     """Return whether `read_table` reads the file: columns of numbers with a time t or t_s, and no choices."""
     if path.is_dir():
-        return True  # read_table says what was expected
+        return True  # read_table raises the error
     if how != How():
         return False
     kind = _kind(path)
@@ -294,7 +294,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     if sheet is None:
         return closely()
     found = _stated(sheet, dialect)
-    found[0].again = closely  # the error of that names the line
+    found[0].again = closely  # reading cell by cell gives an error with the line
     return found
 
 
@@ -706,7 +706,7 @@ def _one_run(sheet: Sheet, t: np.ndarray, rows: np.ndarray, how: How, notes: lis
 def _distinct(
     sheet: Sheet, t: np.ndarray, values: dict[str, np.ndarray], rows: np.ndarray, how: How, notes: list[str]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Give rows of one time times of their own, or make one row of them, as the option says."""
+    """Spread rows with equal times over the interval, or merge them, as the option `equal_times` says."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(t) != 0) + 1])
     counts = np.diff(np.concatenate([starts, [len(t)]]))
     if how.equal_times is None:
