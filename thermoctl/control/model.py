@@ -86,6 +86,15 @@ class CompensatorModel:
             raise ValueError(f"compensator model: kind is '{self.kind}', expected 'mkf' or 'kalman'")
         if sizes["n"] > MAX_ORDER:
             raise ValueError(f"compensator model: order {sizes['n']}, expected at most {MAX_ORDER}")
+        self._check_points(m)
+        if self.R_w < 0.0:
+            raise ValueError(f"compensator model: R_w is {self.R_w}, expected at least 0")
+        if abs(self.f1) >= 1.0:
+            raise ValueError(
+                f"compensator model: f1 is {self.f1}, expected |f1| < 1 (a stable expansion model)"
+            )
+
+    def _check_points(self, m: int) -> None:
         if not self.sensors or self.sensors[0] != 0 or not all(0 <= j < m for j in self.sensors):
             raise ValueError(
                 f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {m}"
@@ -94,14 +103,8 @@ class CompensatorModel:
             raise ValueError(
                 f"compensator model: {m} points with {len(self.points)} names, expected 1 to {MAX_POINTS}, each named"
             )
-        if self.kind == "mkf" and sizes["s"] != 1:
+        if self.kind == "mkf" and len(self.sensors) != 1:
             raise ValueError("compensator model: the MKF corrects by the coil alone")
-        if self.R_w < 0.0:
-            raise ValueError(f"compensator model: R_w is {self.R_w}, expected at least 0")
-        if abs(self.f1) >= 1.0:
-            raise ValueError(
-                f"compensator model: f1 is {self.f1}, expected |f1| < 1 (a stable expansion model)"
-            )
 
     def _check_array(self, name: str, shape: tuple[Any, ...]) -> None:
         value = getattr(self, name)

@@ -177,42 +177,54 @@ def _parts(node: Node, rate: float, corners: list[tuple[float, float]]) -> None:
     if not isinstance(node.value, list) or not node.value:
         raise node.error("a list of parts was expected: hold, trapezoid, pulses or repeat")
     for part in node.value:
-        p = part.value if isinstance(part.value, dict) else {}
-        if "repeat" in p:
-            _keys(part, "a repeated part", {"repeat", "parts"})
-            for _ in range(int(_number(p["repeat"], 1, 1000))):
-                _parts(p["parts"], rate, corners)
-        elif "hold" in p:
-            _keys(part, "a part", {"hold"})
-            for pair in p["hold"].value:
-                if not isinstance(pair.value, list) or len(pair.value) != 2:
-                    raise pair.error("[seconds, um] was expected")
-                _hold(corners, _number(pair.value[0], 0, 1e6), _number(pair.value[1], -1e6, 1e6), rate)
-        elif "trapezoid" in p:
-            z = _keys(p["trapezoid"], "trapezoid", {"low_um", "high_um", "hold_s", "duration_s"})
-            low, high, duration = (_number(z[k], -1e6, 1e6) for k in ("low_um", "high_um", "duration_s"))
-            holds = [_number(h, 0, 1e6) for h in z["hold_s"].value]
-            end = corners[-1][0] + duration
-            for hold in cycle(holds):
-                if corners[-1][0] + 2 * hold + 2 * abs(high - low) / rate > end + 1e-9:
-                    break
-                _hold(corners, hold + abs(high - corners[-1][1]) / rate, high, rate)
-                _hold(corners, hold + abs(low - corners[-1][1]) / rate, low, rate)
-            if corners[-1][0] < end:
-                _hold(corners, end - corners[-1][0], low, rate)
-        elif "pulses" in p:
-            z = _keys(p["pulses"], "pulses", {"count", "high_um", "active_s", "cutoff_hz", "least_s"})
-            widths, gaps = design_pulses(
-                int(_number(z["count"], 1, 6)),
-                _number(z["active_s"], 10, 1e6),
-                _number(z["cutoff_hz"], 1e-6, 10),
-                _number(z["least_s"], 1, 1e6),
-            )
-            for width, gap in zip(widths, gaps, strict=True):
-                _hold(corners, width, _number(z["high_um"], -1e6, 1e6), rate)
-                _hold(corners, gap, 0.0, rate)
-        else:
-            raise part.error("a part is one of hold, trapezoid, pulses, repeat")
+        kind = next((k for k in _PARTS if k in (part.value if isinstance(part.value, dict) else {})), None)
+        if kind is None:
+            raise part.error(f"a part is one of {', '.join(_PARTS)}")
+        _PARTS[kind](part, rate, corners)
+
+
+def _repeat(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
+    p = _keys(part, "a repeated part", {"repeat", "parts"})
+    for _ in range(int(_number(p["repeat"], 1, 1000))):
+        _parts(p["parts"], rate, corners)
+
+
+def _holds(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
+    for pair in _keys(part, "a part", {"hold"})["hold"].value:
+        if not isinstance(pair.value, list) or len(pair.value) != 2:
+            raise pair.error("[seconds, um] was expected")
+        _hold(corners, _number(pair.value[0], 0, 1e6), _number(pair.value[1], -1e6, 1e6), rate)
+
+
+def _trapezoid(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
+    z = _keys(part.value["trapezoid"], "trapezoid", {"low_um", "high_um", "hold_s", "duration_s"})
+    low, high, duration = (_number(z[k], -1e6, 1e6) for k in ("low_um", "high_um", "duration_s"))
+    holds = [_number(h, 0, 1e6) for h in z["hold_s"].value]
+    end = corners[-1][0] + duration
+    for hold in cycle(holds):
+        if corners[-1][0] + 2 * hold + 2 * abs(high - low) / rate > end + 1e-9:
+            break
+        _hold(corners, hold + abs(high - corners[-1][1]) / rate, high, rate)
+        _hold(corners, hold + abs(low - corners[-1][1]) / rate, low, rate)
+    if corners[-1][0] < end:
+        _hold(corners, end - corners[-1][0], low, rate)
+
+
+def _pulses(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
+    z = _keys(part.value["pulses"], "pulses", {"count", "high_um", "active_s", "cutoff_hz", "least_s"})
+    widths, gaps = design_pulses(
+        int(_number(z["count"], 1, 6)),
+        _number(z["active_s"], 10, 1e6),
+        _number(z["cutoff_hz"], 1e-6, 10),
+        _number(z["least_s"], 1, 1e6),
+    )
+    for width, gap in zip(widths, gaps, strict=True):
+        _hold(corners, width, _number(z["high_um"], -1e6, 1e6), rate)
+        _hold(corners, gap, 0.0, rate)
+
+
+_PARTS = {"hold": _holds, "trapezoid": _trapezoid, "pulses": _pulses, "repeat": _repeat}
+"""A part of a schedule by its key; each appends its corners (s, um)."""
 
 
 def _hold(corners: list[tuple[float, float]], seconds: float, value: float, rate: float) -> None:
@@ -336,9 +348,8 @@ def run(
     loses nothing. Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true.
     """
     period = simulation.period_s
-    waiting = [c for c in schedule.commands() if c[0] >= start_s]
-    before = [c for c in schedule.commands() if c[0] < start_s]
-    waiting = ([(start_s, *before[-1][1:])] if before else []) + waiting
+    before = [(start_s, *c[1:]) for c in schedule.commands() if c[0] < start_s]
+    waiting = before[-1:] + [c for c in schedule.commands() if c[0] >= start_s]
     ticks = round((schedule.duration_s - start_s) / period)
     block, began, nxt, k = [], time.monotonic(), 0, 0
     state = AT["state"]
@@ -355,8 +366,7 @@ def run(
         if k % every == 0:
             block.append(row.copy())
         if len(block) == 1000 or k == ticks:
-            if block:
-                yield np.array(block)
+            yield from _stacked(block)
             block = []
             done = start_s + k * period
             if progress is not None:
@@ -364,12 +374,16 @@ def run(
             if stop():
                 raise Aborted("stopped on request", done)
         if row[state] != arming.ARMED:
-            if block:
-                yield np.array(block)
+            yield from _stacked(block)
             standing = [f.name for f in faults.decode(fault_word(row))]
             raise Aborted(
                 f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period
             )
+
+
+def _stacked(rows: list[np.ndarray]) -> Iterator[np.ndarray]:
+    if rows:
+        yield np.array(rows)
 
 
 def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = ()) -> dict[str, Node]:

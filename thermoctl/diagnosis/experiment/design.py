@@ -155,28 +155,31 @@ def _swings(low: float, high: float, period_s: float, duration_s: float) -> Plat
 
 def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the courses of one lever: {description: corners (K, 2)}."""
-    low, high, T = lever.low, lever.high, duration_s
+    low, high, whole = lever.low, lever.high, duration_s
     middle, span = 0.5 * (low + high), high - low
     away = high if high - lever.rest >= lever.rest - low else low
     half = lever.rest + 0.5 * (away - lever.rest)
 
     plans: dict[str, Plateaus] = {
-        "at rest, then held at its end": [(0.1 * T, lever.rest), (0.9 * T, away)],
-        "held at its end, then at rest (warm-up and cool-down)": [(0.5 * T, away), (0.5 * T, lever.rest)],
-        "held at half, then at rest": [(0.5 * T, half), (0.5 * T, lever.rest)],
-        "in four levels up and down": [
-            (T / 7, lever.rest + (away - lever.rest) * q) for q in (0.25, 0.5, 0.75, 1.0, 0.66, 0.33, 0.0)
+        "at rest, then held at its end": [(0.1 * whole, lever.rest), (0.9 * whole, away)],
+        "held at its end, then at rest (warm-up and cool-down)": [
+            (0.5 * whole, away),
+            (0.5 * whole, lever.rest),
         ],
-        "in slow trapezoids": _swings(low, high, T / 2, T),
-        "in fast trapezoids": _swings(low, high, T / 12, T),
-        "in small fast trapezoids": _swings(middle - 0.1 * span, middle + 0.1 * span, T / 12, T),
-        "in a pseudo-random sequence, slow": _pseudo_random(lever, max(T / 20, 2 * step_s), T, seed),
-        "in a pseudo-random sequence, fast": _pseudo_random(lever, max(T / 80, 2 * step_s), T, seed),
+        "held at half, then at rest": [(0.5 * whole, half), (0.5 * whole, lever.rest)],
+        "in four levels up and down": [
+            (whole / 7, lever.rest + (away - lever.rest) * q) for q in (0.25, 0.5, 0.75, 1.0, 0.66, 0.33, 0.0)
+        ],
+        "in slow trapezoids": _swings(low, high, whole / 2, whole),
+        "in fast trapezoids": _swings(low, high, whole / 12, whole),
+        "in small fast trapezoids": _swings(middle - 0.1 * span, middle + 0.1 * span, whole / 12, whole),
+        "in a pseudo-random sequence, slow": _pseudo_random(lever, max(whole / 20, 2 * step_s), whole, seed),
+        "in a pseudo-random sequence, fast": _pseudo_random(lever, max(whole / 80, 2 * step_s), whole, seed),
     }
     out = {k: _ramps(lever, p, step_s) for k, p in plans.items()}
     for word, part in (("large", 1.0), ("small", 0.2)):
-        at = np.linspace(0, T, 9)
-        swing = 0.5 * min(part * span, lever.rate * T / 8)
+        at = np.linspace(0, whole, 9)
+        swing = 0.5 * min(part * span, lever.rate * whole / 8)
         wave = np.where(np.arange(9) % 2, swing, -swing) + middle
         out[f"in {word} triangles"] = np.column_stack([at, wave])
     return out

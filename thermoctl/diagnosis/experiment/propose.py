@@ -91,19 +91,21 @@ def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
     covariance = np.linalg.pinv(f.curvature, hermitian=True)
     place = {q: k for k, q in enumerate(q for q, r in f.fit.unknowns if r is None)}
     nq = len(model.unknowns)
-    P, slopes = np.eye(nq), np.zeros(nq)
+    scaled, slopes = np.eye(nq), np.zeros(nq)
     for c, q in enumerate(model.unknowns):
         p = model.plant.parameters.get(q)
         if c < len(model.active) and p is not None and p.range:
             slopes[c] = Scale(p).slope(p.value)
-            P[c, c] = IN_RANGE
+            scaled[c, c] = IN_RANGE
         elif c >= len(model.active):
             slopes[c] = model.plant.nodes[model.uncertain[c - len(model.active)]].initial_sigma or 0.0
     known = [c for c, q in enumerate(model.unknowns) if q in place and slopes[c]]
     index = [place[model.unknowns[c]] for c in known]
-    P[np.ix_(known, known)] = covariance[np.ix_(index, index)]
-    P[np.diag_indices(nq)] = np.minimum(np.diag(P), 1.0)  # no parameter is more uncertain than its range
-    values, vectors = np.linalg.eigh((P + P.T) / 2)
+    scaled[np.ix_(known, known)] = covariance[np.ix_(index, index)]
+    scaled[np.diag_indices(nq)] = np.minimum(
+        np.diag(scaled), 1.0
+    )  # no parameter is more uncertain than its range
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     return _Predictor(label, weight, model, root, slopes)
 
@@ -124,20 +126,20 @@ def distances(
         for part in (0, 1)
     )
     own = [np.eye(x.shape[1]) + x.T @ x for x in load]
-    D = np.zeros((len(y), len(y)))
+    squared = np.zeros((len(y), len(y)))
     for a in range(len(y)):
         for b in range(a):
             difference = y[a] - y[b]
             inner = np.concatenate([load[a].T @ difference, load[b].T @ difference])
             cross = load[a].T @ load[b]
             taken = np.linalg.solve(np.block([[own[a], cross], [cross.T, own[b]]]), inner)
-            D[a, b] = D[b, a] = float(max(difference @ difference - inner @ taken, 0.0))
-    return D
+            squared[a, b] = squared[b, a] = float(max(difference @ difference - inner @ taken, 0.0))
+    return squared
 
 
-def bits(D: np.ndarray, weights: np.ndarray) -> float:
-    """Compute I of (2)."""
-    return float(-weights @ np.log2(np.exp(-D / 8) @ weights))
+def bits(squared: np.ndarray, weights: np.ndarray) -> float:
+    """Compute I of (2) from D of (1), `squared` (n, n), and the hypotheses' weights (n,)."""
+    return float(-weights @ np.log2(np.exp(-squared / 8) @ weights))
 
 
 def noise_of(case: Case, f: Fitted) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 
 from thermoctl.diagnosis.hypothesis.builder import Builder, Placement
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, askable
+from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, Place, askable
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -70,6 +70,19 @@ class Candidate(Placement):
         return Builder(self, values, ranges or {}).plant()
 
 
+def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:
+    """Return every choice of the signals that an effect needs beside its place."""
+    choices: list[dict[str, Expr]] = [{}]
+    for need in effect.needs:
+        if need in place.symbols:
+            continue
+        found = rig.signals(need, place.nodes.get("v"))
+        if need == "T" and effect.where == "displacement":
+            found = sorted(ex.names(place.symbols["y"]) & set(found)) or found
+        choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
+    return choices
+
+
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     """Return every effect at every place where it can act, with every choice of the signals it needs.
 
@@ -84,17 +97,8 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
             here = effect.at(place.exponent)
             if here is None or not askable(rig, place):
                 continue
-            near = place.nodes.get("v")
-            choices: list[dict[str, Expr]] = [{}]
-            for need in effect.needs:
-                if need in place.symbols:
-                    continue
-                found = rig.signals(need, near)
-                if need == "T" and effect.where == "displacement":
-                    found = sorted(ex.names(place.symbols["y"]) & set(found)) or found
-                choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
             for variant in range(len(effect.changes)):
-                for k, choice in enumerate(choices):
+                for k, choice in enumerate(_choices(rig, effect, place)):
                     candidate = Candidate(here, place, rig, variant, choice, f"{variant}{k}")
                     if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
                         continue  # without a held input it would equal the variant without `straight`

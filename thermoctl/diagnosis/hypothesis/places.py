@@ -182,15 +182,15 @@ def _displacements(rig: Rig) -> Iterator[Place]:
 
 def _members(rig: Rig) -> Iterator[Place]:
     for at in _displacements(rig):
-        for T in rig.signals("T"):
-            yield Place(T, {**at.symbols, "T": name(T)}, output=at.output)
+        for node in rig.signals("T"):
+            yield Place(node, {**at.symbols, "T": name(node)}, output=at.output)
 
 
 def _bending_pairs(rig: Rig) -> Iterator[Place]:
     for at in _displacements(rig):
-        T = rig.signals("T")
-        for k, a in enumerate(T):
-            for b in T[k + 1 :]:
+        temperatures = rig.signals("T")
+        for k, a in enumerate(temperatures):
+            for b in temperatures[k + 1 :]:
                 yield Place(f"{a}-{b}", {**at.symbols, "TA": name(a), "TB": name(b)}, output=at.output)
 
 

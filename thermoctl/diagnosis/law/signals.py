@@ -85,41 +85,40 @@ def places(rig: Structure) -> list[Place]:
 def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs."""
     p, out = rig.physics, []
-    positions = set(rig.pairs.values())
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
-
-    def absolute(n: str, unit: str | None) -> None:
-        """Add a node or an input as a signal."""
-        if unit in TEMPERATURE:
-            out.append(Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit)))
-        else:
-            own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
-            out.append(Signal(n, name(n), unit, position=n in positions, drives=own, recorded=n in p.inputs))
-
-    def difference(a: str, b: str) -> None:
-        """Add the difference of two nodes as a signal."""
-        unit = _difference(p.nodes[a].unit)
-        drives = place.part == "flow"
-        out.append(Signal(f"{a} - {b}", ex.add(name(a), ex.neg(name(b))), unit, drives=drives))
-
     for n in near:
         if rig.air and n in rig.temperatures:
-            difference(n, rig.air)
-        absolute(n, p.nodes[n].unit)
+            out.append(_between(rig, place, n, rig.air))
+        out.append(_absolute(rig, place, n, p.nodes[n].unit))
     if place.source and p.nodes[place.source].unit == p.nodes[place.target].unit:
-        difference(place.source, place.target)
-    for n in p.nodes:
-        if n not in near:
-            absolute(n, p.nodes[n].unit)
-            linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
-            if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
-                difference(place.target, n)
+        out.append(_between(rig, place, place.source, place.target))
+    for n in (n for n in p.nodes if n not in near):
+        out.append(_absolute(rig, place, n, p.nodes[n].unit))
+        linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
+        if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
+            out.append(_between(rig, place, place.target, n))
     clocks = {i for i, q in p.inputs.items() if q.role == "time_of_day"}
     for i in sorted(rig.moving_inputs - clocks):
         if i != rig.air and not i.endswith("_start"):
-            absolute(i, p.inputs[i].unit)
+            out.append(_absolute(rig, place, i, p.inputs[i].unit))
     sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
     return [s for s in sized if s is not None]
+
+
+def _absolute(rig: Structure, place: Place, n: str, unit: str | None) -> Signal:
+    """Return a node or an input as a signal."""
+    if unit in TEMPERATURE:
+        return Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit))
+    own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
+    is_position = n in rig.pairs.values()
+    return Signal(n, name(n), unit, position=is_position, drives=own, recorded=n in rig.physics.inputs)
+
+
+def _between(rig: Structure, place: Place, a: str, b: str) -> Signal:
+    """Return the difference of two nodes as a signal."""
+    unit = _difference(rig.physics.nodes[a].unit)
+    difference = ex.add(name(a), ex.neg(name(b)))
+    return Signal(f"{a} - {b}", difference, unit, drives=place.part == "flow")
 
 
 def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | None:

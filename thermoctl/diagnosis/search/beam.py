@@ -332,9 +332,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         own = ahead.fitted.hypothesis.keys
         if own not in quiet:
             quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        if quiet[own] and np.isinf(gain):
-            return False
-        if parent.score + HALF * ratio * gain < ahead.score:
+        if (quiet[own] and np.isinf(gain)) or parent.score + HALF * ratio * gain < ahead.score:
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
@@ -349,9 +347,8 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         case.budget.planned = case.budget.fits_done + left + len(batch)
         for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
             found = [f for f in fits if not f.absent]
-            if np.isfinite(gain):
-                best_gain = max((f.log_evidence for f in fits), default=-np.inf) - parent.fitted.log_evidence
-                ratio = max(ratio, best_gain / max(gain, 1.0))
+            best_gain = max((f.log_evidence for f in fits), default=-np.inf) - parent.fitted.log_evidence
+            ratio = max(ratio, best_gain / max(gain, 1.0)) if np.isfinite(gain) else ratio
             keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
             s.refused[keys] = INSIGNIFICANT if fits else FAILED
             if found:

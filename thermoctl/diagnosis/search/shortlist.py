@@ -36,7 +36,7 @@ def relabels(c: Candidate) -> bool:
 
 
 def _free_member(c: Candidate, side: str) -> bool:
-    """Does the displacement contain this side's temperature already, with a free coefficient?"""
+    """Return whether the displacement contains this side's temperature already, with a free coefficient."""
     now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
     slope = ex.derivative(now, str(c.place.symbols[side].value))
     parameters = c.rig.plant.parameters
