@@ -8,10 +8,11 @@ import pytest
 
 import thermoctl
 from tests.daemon.conftest import make_model
+from tests.simulated import run_simulated
 from thermoctl.control import arming, faults
 from thermoctl.control.law import OUTPUTS
 from thermoctl.daemon.offline.replay import replay
-from thermoctl.daemon.offline.simulate import Simulation, run_simulated
+from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.daemon.recorder import LAW_VERSION, law_metadata, read_law_metadata
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.files.yamlfile import InputError

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.simulated import run_simulated
 from thermoctl.cli import main
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
-from thermoctl.daemon.offline.simulate import run_simulated
 from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.rig.signals import INDEX

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from tests.rigs.chain import plants, rig_text
+from tests.simulated import run_simulated
 from thermoctl.calibration import chain
 from thermoctl.calibration.recorded import Recorded, filled, of_columns
 from thermoctl.calibration.simulated_rig import with_model
 from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.control.model import CompensatorModel
-from thermoctl.daemon.offline.simulate import run_simulated
 from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.identify.modelfile import save_model
 from thermoctl.rig.signals import AT

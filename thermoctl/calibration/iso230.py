@@ -4,10 +4,7 @@ Deviation x_ij = P_ij - P_i of the j-th approach to target i from one direction;
 
     mean unidirectional deviation     x_i = 1/n sum_j x_ij
     estimator of repeatability        s_i = sqrt(1/(n-1) sum_j (x_ij - x_i)^2)
-    unidirectional repeatability      R_i = 4 s_i, R = max_i R_i            written as x +- 2 s
-    mean bidirectional deviation      (x_up + x_down) / 2;  reversal B_i = x_up - x_down;  M = range of it
-    systematic, unidirectional        E = max x_i - min x_i
-    accuracy, unidirectional          A = max(x_i + 2 s_i) - min(x_i - 2 s_i)
+    written as x +- 2 s
 """
 
 from __future__ import annotations
@@ -33,21 +30,6 @@ class Direction:
     mean: np.ndarray
     s: np.ndarray
     n: np.ndarray
-
-    @property
-    def repeatability(self) -> float:
-        """Return R, the largest 4 s, um."""
-        return float(4 * self.s.max())
-
-    @property
-    def accuracy(self) -> float:
-        """Return A, from the lowest mean - 2 s to the highest mean + 2 s, um."""
-        return float((self.mean + 2 * self.s).max() - (self.mean - 2 * self.s).min())
-
-    @property
-    def systematic(self) -> float:
-        """Return E, the range of the means, um."""
-        return float(self.mean.max() - self.mean.min())
 
 
 def unidirectional(targets_um: np.ndarray, deviations_um: np.ndarray) -> Direction:

@@ -1,14 +1,8 @@
-"""The daemon's own tick in simulated time: as fast as the machine allows, the same rows for the same seed.
-
-Used for experiments, for proofs over hours of rig time, and by tests: `run_simulated` runs a whole schedule,
-`Simulation` one tick at a time.
-"""
+"""The daemon's own tick in simulated time: as fast as the machine allows, the same rows for the same seed."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -117,38 +111,6 @@ class Simulation:
 
 def _no_clock() -> int:
     return 0
-
-
-def run_simulated(
-    settings: Settings,
-    schedule: Iterable[tuple[Any, ...]],
-    duration_s: float,
-    seed: int | None = None,
-    every: int = 1,
-    model: CompensatorModel | None = None,
-) -> np.ndarray:
-    """Run `duration_s` of rig time; returns every `every`-th row, (N, signals).
-
-    schedule: (time_s, command, value) in order of time; command arm, disarm or setpoint (um). seed replaces
-    hal.seed.
-    """
-    if seed is not None:
-        settings = dataclasses.replace(settings, hal=dataclasses.replace(settings.hal, seed=seed))
-    simulation = Simulation(settings, model)
-    period_s = simulation.period_s
-    waiting = deque((round(item[0] / period_s), *item[1:]) for item in schedule)
-    ticks = round(duration_s / period_s)
-    rows = np.empty((ticks // every, len(settings.row)))
-    try:
-        for k in range(ticks):
-            while waiting and waiting[0][0] <= k:
-                simulation.command(*waiting.popleft()[1:])
-            simulation.tick()
-            if (k + 1) % every == 0:
-                rows[k // every] = simulation.row
-    finally:
-        simulation.close()
-    return rows
 
 
 SETTLE_S = 0.5  # settling time at the setpoint before the deviation counts
