@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +28,17 @@ from tests.laws.rigs import Made, make
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, fitted
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.law.signals import Place, signals
+from thermoctl.diagnosis.law.signals import Place, Signal, signals
 from thermoctl.diagnosis.law.smooth import LATENT, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import expression as ex
+from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 MOST = 600  # samples that a peer is given
 Predict = Callable[[np.ndarray], np.ndarray]
+Flow = tuple[list[Signal], np.ndarray, np.ndarray]
 
 
 def sindy(x: np.ndarray, y: np.ndarray) -> Predict:
@@ -84,20 +88,24 @@ def gp(x: np.ndarray, y: np.ndarray) -> Predict:
 PEERS = {"sindy": sindy, "gplearn": gplearn, "gp": gp}
 
 
-def smoothed(made: Made) -> tuple[Fitted, list, np.ndarray, np.ndarray]:
-    """The refitted plant, the signals at the true place, their values (N, k) and the smoothed flow (N,)."""
-    known = case(made.plant, made.tables[:2], {}, Budget(limits().fits))
+def smoothed(plant: Plant, tables: Sequence[Table], nodes: Sequence[str]) -> tuple[Fitted, dict[str, Flow]]:
+    """The refitted plant; by node the signals there, their values (N, k) and the smoothed flow (N,)."""
+    known = case(plant, tables, {}, Budget(limits().fits))
     first = as_refitted(known, fitted(known, known.plant, (), known.null))
-    at = tracked(known, first, [made.law.target])
+    at = tracked(known, first, list(nodes))
     rig = Structure(first.rough_plant, known.drives(first.rough.model), [t.columns for t in known.tables])
-    found = signals(rig, Place(made.law.target), at.runs)
-    x = np.concatenate([_values(found, run) for run in at.runs])
-    y = np.concatenate([np.asarray(run[f"{LATENT}{made.law.target}"]) for run in at.runs])
-    keep = np.linspace(0, len(y) - 1, min(MOST, len(y))).astype(int)
-    return first, found, x[keep], y[keep]
+    flows = {}
+    for node in nodes:
+        found = signals(rig, Place(node), at.runs)
+        x = np.concatenate([values(found, run) for run in at.runs])
+        y = np.concatenate([np.asarray(run[f"{LATENT}{node}"]) for run in at.runs])
+        keep = np.linspace(0, len(y) - 1, min(MOST, len(y))).astype(int)
+        flows[node] = found, x[keep], y[keep]
+    return first, flows
 
 
-def _values(found: list, run: dict) -> np.ndarray:
+def values(found: Sequence[Signal], run: Mapping[str, Any]) -> np.ndarray:
+    """The signals (N, k) along a run, each in its own size."""
     n = len(run["t"])
     return np.stack(
         [(np.broadcast_to(ex.evaluate(s.value, run), n) - s.centre) / s.size for s in found], axis=1
@@ -142,7 +150,7 @@ def judged(made: Made, first: Fitted, found: list, x: np.ndarray, predict: Predi
             )
         )
     )
-    delta = net(first.plant) + predict(_values(found, run)) / storage - net(made.truth)
+    delta = net(first.plant) + predict(values(found, run)) / storage - net(made.truth)
     own = net(without(made.truth)) - net(made.truth)
     return {
         "variable": used - AMBIENT == set(made.law.variables) - AMBIENT,
@@ -167,7 +175,8 @@ def main() -> None:
                 "seconds": ours["seconds"],
             }
         )
-        first, found, x, y = smoothed(made)
+        first, flows = smoothed(made.plant, made.tables[:2], [made.law.target])
+        found, x, y = flows[made.law.target]
         for m, method in PEERS.items():
             started = time.process_time()
             try:
