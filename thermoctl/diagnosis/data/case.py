@@ -26,6 +26,7 @@ from thermoctl.plant.fitting.cores import give_back
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant
+from thermoctl.plant.parts import direct_outputs
 from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
 
@@ -114,10 +115,13 @@ class Case:
     outliers: Outliers = ()
 
     def drives(self, model: Model) -> list[Excitation]:
-        """Return the recordings as a model reads them. Models that read the same columns share the arrays."""
-        if _readings(model) == _readings(self.null.model):
-            return [dataclasses.replace(d) for d in self._read]
-        return self._excitations(model)
+        """Return the recordings as a model reads them. Models that read the same columns share the arrays.
+
+        A part after a gap starts from its readings, also in a model with further states."""
+        null = self.null.model
+        if _readings(model) != _readings(null):
+            return self._excitations(model)
+        return [dataclasses.replace(d, x0=_start(d, null.states, model)) for d in self._read]
 
     @cached_property
     def _read(self) -> list[Excitation]:
@@ -125,6 +129,30 @@ class Case:
 
     def _excitations(self, model: Model) -> list[Excitation]:
         return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
+
+
+def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
+    """Return where a part's states start, in the order of a model with further states; NaN: as the plant states.
+
+    A further state starts from its own reading. Without one it starts beside the node that it exchanges with,
+    where both start alike at the beginning of the recording."""
+    if d.x0 is None:
+        return None
+    known = dict(zip(of, d.x0, strict=True))
+    plant, read = model.plant, direct_outputs(model.plant)
+
+    def start(state: str) -> float:
+        """Return the start of one state."""
+        if state in known:
+            return float(known[state])
+        if read.get(state) in d.first:
+            return d.first[read[state]]
+        ends = ({f.source, f.target} for f in plant.flows.values())
+        beside = [n for pair in ends if state in pair for n in known if n in pair]
+        alike = (n for n in beside if plant.nodes[n].initial == plant.nodes[state].initial)
+        return float(known.get(next(alike, ""), np.nan))
+
+    return np.array([start(n) for n in model.states])
 
 
 def _readings(model: Model) -> list[Any]:
