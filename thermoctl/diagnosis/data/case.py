@@ -132,10 +132,10 @@ class Case:
 
 
 def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
-    """Return where a part's states start, in the order of a model with further states; NaN: as the plant states.
+    """Return where a part's states start, by the states of a model that has more; NaN: the plant states it.
 
-    A further state starts from its own reading. Without one it starts beside the node that it exchanges with,
-    where both start alike at the beginning of the recording."""
+    A further state starts from its own reading. Without one it starts like the node that it exchanges with, if
+    the plant states the same initial value for both."""
     if d.x0 is None:
         return None
     known = dict(zip(of, d.x0, strict=True))
@@ -149,8 +149,8 @@ def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
             return d.first[read[state]]
         ends = ({f.source, f.target} for f in plant.flows.values())
         beside = [n for pair in ends if state in pair for n in known if n in pair]
-        alike = (n for n in beside if plant.nodes[n].initial == plant.nodes[state].initial)
-        return float(known.get(next(alike, ""), np.nan))
+        same = (n for n in beside if plant.nodes[n].initial == plant.nodes[state].initial)
+        return float(known.get(next(same, ""), np.nan))
 
     return np.array([start(n) for n in model.states])
 
