@@ -132,10 +132,12 @@ class Case:
 
 
 def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
-    """Return where a part's states start, by the states of a model that has more; NaN: the plant states it.
+    """Return where a part's states start, by the states of a model that has more.
 
-    A further state starts from its own reading. Without one it starts like the node that it exchanges with, if
-    the plant states the same initial value for both."""
+    NaN: the plant states it.
+
+    A further state starts from its own reading. Without one it starts like the node that it exchanges
+    with, if the plant states the same initial value for both."""
     if d.x0 is None:
         return None
     known = dict(zip(of, d.x0, strict=True))
