@@ -411,7 +411,7 @@ SYSTEMS = (
         "form always right, parameters 0.002 off (one global fit: 0.43)",
     ),
     System(
-        "predator and prey",
+        "predator and prey, both terms missing",
         POPULATIONS,
         ("rabbits", "wolves"),
         _populations,
@@ -424,6 +424,18 @@ SYSTEMS = (
         lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
         lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
         "both terms",
+    ),
+    System(
+        "predator and prey, one term known",
+        POPULATIONS.replace("outputs:", "  eaten: {from: rabbits, rate: 0.9 * rabbits * wolves}\noutputs:"),
+        ("rabbits", "wolves"),
+        _populations,
+        {"wolves": lambda q, k: k * q["rabbits"] * q["wolves"]},
+        {"wolves": (0.8,)},
+        {"x": "rabbits", "y": "wolves"},
+        lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
+        lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
+        "",
     ),
     System(
         "bioreactor",
