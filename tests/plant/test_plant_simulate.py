@@ -211,3 +211,44 @@ def test_a_factorisation_by_table_gives_the_same_bytes_as_one_written_out(monkey
         monkeypatch.setattr("thermoctl.plant.simulation.compile._LOADED", {})
         runs.append(compile_plant(plant).simulate(Table("run", "run", t, columns), sensitivities=True))
     assert np.array_equal(runs[0].y, runs[1].y) and np.array_equal(runs[0].dy, runs[1].dy)
+
+
+@pytest.mark.parametrize("push", [1.3, 2.0, 5.0])
+def test_a_jump_inside_a_step_is_followed(push):
+    """A mass under dry friction reverses between samples, against a far smaller tolerance."""
+    plant = loads(
+        HEAD
+        + """
+inputs: {P: {unit: N, between_samples: linear}}
+parameters: {m: {value: 2}, F: {value: 1}}
+nodes: {v: {storage: m, initial: 0.1}, x: {storage: 1, initial: 0}}
+flows: {push: {into: v, rate: P}, dry: {from: v, rate: F * sign(v)}, go: {into: x, rate: v}}
+outputs: {speed: {value: v}, y: {value: x}}"""
+    )
+    model, t = compile_plant(plant), np.arange(0.0, 30.0, 0.1)
+    d = model.excitation(Table("jump", "jump", t, {"P": push * np.cos(0.7 * t)}))
+    found, exact = model.run(d).y, model.run(dataclasses.replace(d, rtol=1e-11)).y
+    assert np.ptp(np.sign(exact[:, 0])) == 2
+    np.testing.assert_allclose(found / np.ptp(exact, axis=0), exact / np.ptp(exact, axis=0), atol=2e-4)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("start", [0.0, 3.3])
+def test_slopes_of_a_body_that_comes_to_rest_stay_small(width, start):
+    """Dry friction alone: the body stops, and no parameter can move it any more, however stiff the rest is."""
+    plant = loads(
+        HEAD
+        + f"""
+inputs: {{P: {{unit: N}}}}
+parameters: {{F: {{value: 1, range: [0.1, 9]}}}}
+nodes: {{v: {{storage: 1, initial: {start}, initial_sigma: 1}}, x: {{storage: 1, initial: 0}}}}
+flows: {{push: {{into: v, rate: P}}, dry: {{from: v, rate: F * tanh(v / {width})}}, go: {{into: x, rate: v}}}}
+outputs: {{y: {{value: x}}}}"""
+    )
+    t = np.arange(0.0, 20.0, 0.5)
+    for rtol in (1e-7, 1e-5):
+        run = compile_plant(plant).simulate(Table("r", "r", t, {"P": 0 * t}), sensitivities=True, rtol=rtol)
+        stop = start**2 / 2  # x at rest, of a start v: v^2 / 2 F
+        np.testing.assert_allclose(run.y[-1, 0], stop, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(run.dy[-1, 0], [-stop, start], rtol=0.02, atol=0.02)
+        assert np.all(np.abs(run.dx[-1, 0]) < 0.02) and np.all(np.abs(run.dx) < 30)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from thermoctl.plant import expression as ex
@@ -106,7 +106,7 @@ class Code(Equations):
             ),
             f"static void rhs_{args}, double *out) {{\n{self.emit(self.slopes)}}}\n",
             f"static void jac_{args}, double *out) {{\n{self.emit([d for *_, d in jac])}}}\n",
-            f"static void sens_{args}, double *out) {{\n{self.emit([d for *_, d in sens])}}}\n",
+            f"static void sens_{args}, double *out) {{\n{self.emit([d for *_, d in ([] if self.linear else jac) + sens])}}}\n",
         ]
         for (values, entries), fn in zip(lists, ("outputs_", "delayed_"), strict=True):
             parts += [
@@ -114,7 +114,7 @@ class Code(Equations):
                 f"static void {fn[:-1]}_slopes_{args}, const double *d, double *out) {{\n"
                 f"{self.emit([e[3] for e in entries])}}}\n",
             ]
-        return "\n".join([*parts, lu, lu_lanes, '#include "integrator.h"\n'])
+        return "\n".join([*parts, lu, lu_lanes, _product(jac), '#include "integrator.h"\n'])
 
     def _declared(self) -> list[str]:
         """Return the C that declares the functions of FMUs; their contents are part of the source's key."""
@@ -125,6 +125,15 @@ class Code(Equations):
             f"{contents}double (*fmu_value_)(void *, int, const double *), "
             f"(*fmu_slope_)(void *, int, int, const double *);\nvoid *fmus_[{len(self.fmus)}];\n"
         ]
+
+
+def _product(jac: Sequence[tuple[int, int, Expr]]) -> str:
+    """Return C that adds J R to k for eight columns, a statement for each row: sums stay in registers."""
+    rows: dict[int, list[str]] = {}
+    for q, (i, k, _) in enumerate(jac):
+        rows.setdefault(i, []).append(f"J[{q}] * R[{k}]")
+    text = "".join(f"k[{i}] += {' + '.join(terms)};\n" for i, terms in rows.items())
+    return f"static inline void multiply_lanes_(const double *J, const lanes *R, lanes *restrict k) {{ (void)J; (void)R; (void)k;\n{text}}}\n"
 
 
 # ------------------------------------------------------------------------------------------------------

@@ -1,7 +1,9 @@
 /* The integrator behind every compiled plant. The generated file defines the sizes, the pattern of the Jacobian and the
    functions rhs_, jac_, sens_, factor_, solve_, solve_lanes_ and includes this file.
 
-   States by esdirk.h. Sensitivities S = dx/dq are the exact derivative of the converged step:
+   Inputs change at each sample, so that most steps are far shorter than accuracy needs: an explicit step is tried first, and
+   esdirk.h takes those where its error does not pass or the plant is stiff. Sensitivities S = dx/dq are the exact derivative
+   of the step that was taken; of ESDIRK's
        (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
 #include "esdirk.h"
 
@@ -31,7 +33,7 @@ typedef struct { int count; const int *row, *col; const double *q; } Forces;
 /* The columns of S go through a step LANES at a time, in the processor's registers. Entries V of F_p belong to columns: `entry`
    lists them by group of lanes, those of group g from begin[g] on, and `slot` their places in the group's (NX, LANES). */
 #define LANES 8
-typedef struct { int nc, groups, count, *begin, *entry, *slot; double *V, *S; } Columns;
+typedef struct { int nc, groups, count, *begin, *entry, *slot; double *JV, *S; } Columns;
 
 static int columns_(Columns *c, int nc, const double *S0, const Forces *force) {
   const int *row = force ? force->row : V_ROW, *col = force ? force->col : V_COL;
@@ -39,10 +41,10 @@ static int columns_(Columns *c, int nc, const double *S0, const Forces *force) {
   c->groups = (nc + LANES - 1) / LANES;
   c->count = force ? force->count : NV;
   size_t size = (size_t)c->groups * NX * LANES;
-  c->S = calloc(size + STAGES * (size_t)c->count + 1, sizeof(double));
+  c->S = calloc(size + STAGES * (NJ + (size_t)c->count) + 1, sizeof(double));
   c->begin = calloc((size_t)c->groups + 1 + 2 * (size_t)c->count, sizeof(int));
   if (!c->S || !c->begin) { free(c->S); free(c->begin); return 0; }
-  c->V = c->S + size;
+  c->JV = c->S + size;
   c->entry = c->begin + c->groups + 1;
   c->slot = c->entry + c->count;
   for (int g = 0, at = 0; g < c->groups; g++) {
@@ -56,26 +58,36 @@ static int columns_(Columns *c, int nc, const double *S0, const Forces *force) {
 
 static void columns_out_(const Columns *c, double *S) {
   for (int g = 0; g < c->groups; g++) {
-    int wide = c->nc - g * LANES < LANES ? c->nc - g * LANES : LANES;
-    for (int i = 0; i < NX; i++) memcpy(S + (size_t)i * c->nc + g * LANES, c->S + ((size_t)g * NX + i) * LANES, wide * sizeof(double));
+    const int wide = c->nc - g * LANES;
+    const double *from = c->S + (size_t)g * NX * LANES;
+    double *to = S + g * LANES;
+    for (int i = 0; i < NX; i++, from += LANES, to += c->nc)
+      if (wide >= LANES) *(lanes *)to = *(const lanes *)from; else memcpy(to, from, wide * sizeof(double));
   }
+}
+
+/* J, if the plant is not linear, and the entries V of F_p at point s of a step; returns V, which follows J. */
+static double *tangents_(double t, double part, const double *u, const double *p, const double *w, const double *X, Columns *c, int s,
+                         const Forces *force, int n) {
+  double *J = c->JV + (size_t)s * (NJ + c->count), *V = J + NJ;
+  if (force) {
+    const double *q0 = force->q + (size_t)n * c->count, *q1 = q0 + c->count;
+    for (int e = 0; e < c->count; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
+    if (!LINEAR) jac_(t, X, u, p, w, J);
+  } else sens_(t, X, u, p, w, LINEAR ? V : J);
+  return V;
 }
 
 /* The sensitivities over the step that try_step accepted; c->S is advanced in place. Ms: the stages' factors. */
 static int sens_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
                      const double *p, const double *w, const double *xs, Columns *c, double *Ms, double *hfac, const Forces *force, int n) {
-  double u[NU + 1], J[NJ + 1], J0[NJ + 1];
+  double u[NU + 1];
   for (int s = 0; s < STAGES; s++) {
-    double ts = t + C_[s] * h, *V = c->V + (size_t)s * c->count;
-    const double *X = xs + s * NX;
+    const double ts = t + C_[s] * h, *X = xs + s * NX;
     inputs_at((ts - ta) / dt, u0, u1, lin, u);
-    if (force) {
-      const double *q0 = force->q + (size_t)n * c->count, *q1 = q0 + c->count, part = (ts - ta) / dt;
-      for (int e = 0; e < c->count; e++) V[e] = q0[e] + part * (q1[e] - q0[e]);
-    } else sens_(ts, X, u, p, w, V);
-    if (s == 0) jac_(ts, X, u, p, w, J0);
-    else if (!LINEAR || *hfac != h) {
-      jac_(ts, X, u, p, w, J);
+    double *J = tangents_(ts, (ts - ta) / dt, u, p, w, X, c, s, force, n) - NJ;
+    if (LINEAR && (s == 0 || *hfac != h)) jac_(ts, X, u, p, w, J);
+    if (s && (!LINEAR || *hfac != h)) {
       if (!factor_(h * G, J, Ms + (LINEAR ? 0 : s * (NM + 1)))) return 0;
       if (LINEAR) *hfac = h;
     }
@@ -87,13 +99,13 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
     const int first = c->begin[g], last = c->begin[g + 1];
     memset(F, 0, sizeof F);
     for (int s = 0; s < STAGES; s++) {
-      const double *V = c->V + (size_t)s * c->count;
+      const double *V = c->JV + (size_t)s * (NJ + c->count) + NJ, *J0 = c->JV;
       for (int e = first; e < last; e++) F[c->slot[e]] += V[c->entry[e]];
       lanes *const k = K[s];
       const lanes *const f = (const lanes *)F;
       if (s == 0) {
         for (int i = 0; i < NX; i++) k[i] = f[i];
-        for (int q = 0; q < NJ; q++) k[J_ROW[q]] += J0[q] * S[J_COL[q]];
+        multiply_lanes_(J0, S, k);
       } else {
         const double a0 = h * A_[s][0], a1 = h * A_[s][1], a2 = h * A_[s][2], a3 = h * A_[s][3], a4 = h * A_[s][4];
         switch (s) {
@@ -114,62 +126,178 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
   return 1;
 }
 
+/* Explicit steps of order 4: the classical method, with Zonneveld's fifth point for an error of order 3 (Hairer, Norsett, Wanner,
+   Solving ODEs I, sec. II.4; a quarter of the difference, still far above the error). No weight of it is small: a jump between
+   any two points shows. */
+#define POINTS 4
+static const double RC_[POINTS + 1] = {0, 0.5, 0.5, 1, 0.75}, RB_[POINTS] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
+static const double RA_[POINTS] = {5.0 / 32, 7.0 / 32, 13.0 / 32, -1.0 / 32};
+static const double RE_[POINTS + 1] = {1.0 / 6, -0.5, -0.5, -0.5, 4.0 / 3};
+#define SHORT 0.2        /* of what is left to the next sample: where explicit steps are shorter, ESDIRK takes the next ones */
+#define STEEP 0.5        /* largest step times a bound of the eigenvalues; a state at rest passes any longer step, its slopes grow */
+#define LONGEST_WAIT 16  /* steps of ESDIRK before the next explicit try: 1, doubled with each failure */
+
+/* A bound of the eigenvalues of J, 1/s: max (|J| z)_i / z_i of positive z. z is made better until h times the bound is at most
+   STEEP; where that fails z is left as it was. */
+static double steepest_(const double *J, double h, double *z) {
+  double bound = 0, better[NX + 1];
+  memcpy(better, z, NX * sizeof(double));
+  for (int round = 0; round < 12; round++) {
+    double y[NX + 1];
+    memset(y, 0, sizeof y);
+    for (int q = 0; q < NJ; q++) y[J_ROW[q]] += fabs(J[q]) * better[J_COL[q]];
+    bound = 0;
+    for (int i = 0; i < NX; i++) { double a = y[i] / better[i]; if (!(a <= bound)) bound = a; }
+    if (h * bound <= STEEP) { if (round) memcpy(z, better, NX * sizeof(double)); break; }
+    if (!(bound < 1e300)) break;
+    for (int i = 0; i < NX; i++) better[i] = fmax(0.5 * (better[i] + y[i] / bound), 1e-250);
+  }
+  return bound;
+}
+
+/* One explicit step of at most *h, which becomes the step that STEEP allows. xs: states at the points; z: as of steepest_, whose
+   last bound is *steep (below 0: none yet). Returns the norm of the error, or -1 where *h falls below `least`. */
+static double try_explicit(double t, double *h, double least, double ta, double dt, const double *u0, const double *u1, const int *lin,
+                           const double *p, const double *w, const double *x, double rtol, const double *atol,
+                           double *xs, double *xn, double *z, double *steep) {
+  double u[NU + 1], e[NX + 1], k[POINTS + 1][NX + 1], J[NJ + 1];
+  for (int s = 0; s <= POINTS; s++) {
+    const double ts = t + RC_[s] * *h;
+    double *const X = xs + s * NX;
+    inputs_at((ts - ta) / dt, u0, u1, lin, u);
+    if (s == 0) {
+      memcpy(X, x, NX * sizeof(double));
+      if (!LINEAR || *steep < 0) { jac_(ts, x, u, p, w, J); *steep = steepest_(J, *h, z); }
+      if (!(*h * *steep <= STEEP)) {
+        *h /= ceil(*h * *steep / STEEP);
+        if (!(*h >= least)) return -1;
+      }
+    } else if (s < POINTS) for (int i = 0; i < NX; i++) X[i] = x[i] + *h * RC_[s] * k[s - 1][i];
+    else for (int i = 0; i < NX; i++) X[i] = x[i] + *h * (RA_[0] * k[0][i] + RA_[1] * k[1][i] + RA_[2] * k[2][i] + RA_[3] * k[3][i]);
+    rhs_(ts, X, u, p, w, k[s]);
+  }
+  for (int i = 0; i < NX; i++) {
+    xn[i] = x[i] + *h * (RB_[0] * k[0][i] + RB_[1] * k[1][i] + RB_[2] * k[2][i] + RB_[3] * k[3][i]);
+    e[i] = *h * (RE_[0] * k[0][i] + RE_[1] * k[1][i] + RE_[2] * k[2][i] + RE_[3] * k[3][i] + RE_[4] * k[4][i]);
+  }
+  return norm_(e, x, xn, rtol, atol);
+}
+
+/* The sensitivities over the step that try_explicit accepted; c->S is advanced in place. Returns 0 where J gets steep within the step. */
+static int sens_explicit(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
+                          const double *p, const double *w, const double *xs, const double *z, Columns *c, const Forces *force, int n) {
+  double u[NU + 1], own[NX + 1];
+  memcpy(own, z, sizeof own);
+  for (int s = 0; s < POINTS; s++) {
+    const double ts = t + RC_[s] * h;
+    inputs_at((ts - ta) / dt, u0, u1, lin, u);
+    const double *J = tangents_(ts, (ts - ta) / dt, u, p, w, xs + s * NX, c, s, force, n) - NJ;
+    if (LINEAR && !s) jac_(ts, xs, u, p, w, c->JV);
+    if (!LINEAR && s && !(h / 4 * steepest_(J, h / 4, own) <= STEEP)) return 0;
+  }
+  for (int g = 0; g < c->groups; g++) {
+    lanes k[NX + 1], R[NX + 1], sum[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
+    for (int s = 0; s < POINTS; s++) {
+      const double *j = c->JV + (LINEAR ? 0 : (size_t)s * (NJ + c->count)), *V = c->JV + (size_t)s * (NJ + c->count) + NJ;
+      for (int i = 0; i < NX; i++) R[i] = s ? S[i] + h * RC_[s] * k[i] : S[i];
+      memset(k, 0, sizeof k);
+      for (int e = c->begin[g]; e < c->begin[g + 1]; e++) ((double *)k)[c->slot[e]] += V[c->entry[e]];
+      multiply_lanes_(j, R, k);
+      for (int i = 0; i < NX; i++) sum[i] = s ? sum[i] + h * RB_[s] * k[i] : h * RB_[0] * k[i];
+    }
+    for (int i = 0; i < NX; i++) S[i] += sum[i];
+  }
+  return 1;
+}
+
+/* to = a from, or to += a from; (n,) each. Groups of lanes of `from` begin `step` apart. */
+static void times_(double a, const double *from, int step, int n, double *to, int add) {
+  for (; n >= LANES; n -= LANES, from += step, to += LANES) {
+    const lanes b = a * *(const lanes *)from;
+    *(lanes *)to = add ? *(lanes *)to + b : b;
+  }
+  for (int c = 0; c < n; c++) to[c] = (add ? to[c] : 0) + a * from[c];
+}
+
+/* One sample's outputs of one list, see observe. S: sensitivities of the states, a state's `next` apart, its groups of lanes `step`. */
+static void look_(int o, double t, const double *u, const double *p, const double *w, const double *x, const double *S, int next,
+                  int step, int nc, const double *d, const double *sd, double *y, double *sy, int own) {
+  if (o) delayed_(t, x, u, p, w, d, y); else outputs_(t, x, u, p, w, d, y);
+  if (!sy) return;
+  double V[NO + 1];
+  const int ny = o ? ND : NY, count = o ? NO1 : NO0, *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
+  if (o) delayed_slopes_(t, x, u, p, w, d, V); else outputs_slopes_(t, x, u, p, w, d, V);
+  for (int r = 0, q = 0; r < ny; r++, sy += nc) {                  /* of a row's entries those by states come first */
+    int add = q < count && row[q] == r && kind[q] == 0;
+    if (add) times_(V[q], S + col[q] * next, step, nc, sy, 0), q++; else memset(sy, 0, nc * sizeof(double));
+    for (; q < count && row[q] == r; q++)
+      if (kind[q] == 0) times_(V[q], S + col[q] * next, step, nc, sy, 1);
+      else if (kind[q] == 2) times_(V[q], sd + col[q] * nc, LANES, nc, sy, 1);                     /* by a delay */
+      else if (own) sy[col[q]] += V[q];                                                          /* by a parameter */
+  }
+}
+
 /* Outputs of one list (o = 0: the outputs, 1: the arguments of their delays) at N samples. D: N x ND values of the delays
    and SD their sensitivities (N x ND x nc), NULL for list 1. Y: N x NYo, SY: N x NYo x nc or NULL. `own`: the columns of SX
    are sensitivities, so that the outputs' own slopes by the parameters count. */
 void observe(int o, int N, const double *t, const double *U, const double *p, const double *w, const double *X,
              const double *SX, int nc, const double *D, const double *SD, double *Y, double *SY, int own) {
-  int ny = o ? ND : NY;
-  for (int n = 0; n < N; n++) {
-    const double *x = X + (size_t)n * NX, *u = U + (size_t)n * NU, *d = D ? D + (size_t)n * ND : 0;
-    double *y = Y + (size_t)n * ny;
-    if (o) delayed_(t[n], x, u, p, w, d, y); else outputs_(t[n], x, u, p, w, d, y);
-    if (!SY) continue;
-    double V[NO + 1], *sy = SY + (size_t)n * ny * nc;
-    int count = o ? NO1 : NO0;
-    const int *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
-    if (o) delayed_slopes_(t[n], x, u, p, w, d, V); else outputs_slopes_(t[n], x, u, p, w, d, V);
-    memset(sy, 0, (size_t)ny * nc * sizeof(double));
-    for (int q = 0; q < count; q++) {
-      double *to = sy + (size_t)row[q] * nc;
-      if (kind[q] == 1) { if (own) to[col[q]] += V[q]; continue; }                                  /* by a parameter */
-      const double *from = kind[q] == 0 ? SX + ((size_t)n * NX + col[q]) * nc : SD + ((size_t)n * ND + col[q]) * nc;
-      for (int c = 0; c < nc; c++) to[c] += V[q] * from[c];                                /* by a state or a delay */
-    }
-  }
+  const size_t ny = o ? ND : NY;
+  for (size_t n = 0; n < N; n++)
+    look_(o, t[n], U + n * NU, p, w, X + n * NX, SX + n * NX * nc, nc, LANES, nc, D ? D + n * ND : 0, SD ? SD + n * ND * nc : 0,
+          Y + n * ny, SY ? SY + n * ny * nc : 0, own);
 }
 
-/* Integrate over N samples. Returns 0, or 1 + the index of the interval that could not be integrated. info[0]: steps,
-   info[1]: rejected. X: N x NX, SX: N x NX x nc or NULL (S0: NX x nc). With SY (N x NY x nc, no delays of outputs) the outputs
-   are observed at each sample, and SX is one sample's (NX x nc): memory grows with the outputs, not with the states. */
+/* Integrate over N samples. Returns 0, or 1 + the index of the interval that could not be integrated. info: steps,
+   rejected. X: N x NX. With nc columns of sensitivities (S0: NX x nc): SX, N x NX x nc, or Y and SY (N x NY x nc, no delays of
+   outputs), the outputs at each sample: memory grows with the outputs, not with the states. */
 int integrate(int N, const double *t, const double *U, const int *lin, const double *p, const double *w, const double *x0,
               const double *S0, int nc, double rtol, const double *atol, int max_steps, double *X, double *SX,
               double *info, const Forces *force, double *Y, double *SY, int own) {
-  double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1], Ms[(LINEAR ? 1 : STAGES) * (NM + 1)];
+  double x[NX + 1], xn[NX + 1], k[STAGES * (NX + 1)], xs[STAGES * (NX + 1)], M[NM + 1], Ms[(LINEAR ? 1 : STAGES) * (NM + 1)], z[NX + 1];
   size_t block = (size_t)NX * nc;
-  double want = 0, hfac = 0, hfac_s = 0;
+  double want = 0, hfac = 0, hfac_s = 0, steep = -1, reach = 0;
+  int skip = 0, wait = 1;                              /* steps that ESDIRK takes before the next explicit try */
   Columns c = {0};
-  if (SX) {
-    if (!columns_(&c, nc, S0, force)) return -1;
-    memcpy(SX, S0, block * sizeof(double));
-  }
+  if (nc && !columns_(&c, nc, S0, force)) return -1;
+  if (SX) memcpy(SX, S0, block * sizeof(double));
   int failed_at = 0;
   const unsigned long mode = flush_();
+  for (int i = 0; i < NX; i++) z[i] = atol[i];
   memcpy(x, x0, NX * sizeof(double));
   memcpy(X, x0, NX * sizeof(double));
   info[0] = info[1] = 0;
-  if (SY) observe(0, 1, t, U, p, w, X, SX, nc, 0, 0, Y, SY, own);
+  if (SY) look_(0, t[0], U, p, w, X, c.S, LANES, NX * LANES, nc, 0, 0, Y, SY, own);
   for (int n = 0; n + 1 < N; n++) {
     const double *u0 = U + (size_t)n * NU, *u1 = u0 + NU;
     double ta = t[n], dt = t[n + 1] - ta, at = ta;
     int steps = 0, failed = 0;
     while (at < t[n + 1]) {
-      double left = t[n + 1] - at, h = want <= 0 || want >= left * 0.999 ? left : want;
+      const double left = t[n + 1] - at;
+      if (++steps > max_steps) { failed_at = n + 1; goto out; }
+      double h = reach <= 0 || reach > left ? left : left / ceil(left / reach);
+      if (skip) skip--;
+      else if (h >= left * SHORT) {
+        double err = try_explicit(at, &h, left * SHORT, ta, dt, u0, u1, lin, p, w, x, rtol, atol, xs, xn, z, &steep);
+        double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-3), -0.25));
+        if (err >= 0 && err <= 1 && (!nc || sens_explicit(at, h, ta, dt, u0, u1, lin, p, w, xs, z, &c, force, n))) {
+          memcpy(x, xn, NX * sizeof(double));
+          info[0]++;
+          reach = h < left ? grow : fmax(reach, grow);
+          at = h < left ? at + h : t[n + 1];
+          wait = 1;
+          continue;
+        }
+        if (err > 1 && err < 1e9 && grow >= left * SHORT) { reach = grow; info[1]++; continue; }
+        skip = wait;
+        if (wait < LONGEST_WAIT) wait *= 2;
+      }
+      reach = 0;
+      h = want <= 0 || want >= left * 0.999 ? left : want;
       if (h < left && 2 * h > left) h = left / 2;
       int last = h >= left;
       if (last) h = left;
       if (last && at == ta && fabs(h - hfac) < 1e-9 * h) h = hfac;  /* a clock equal but for rounding: same factors */
-      if (++steps > max_steps) { failed_at = n + 1; goto out; }
       double err = try_step(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
       if (!(err >= 0 && err <= 1)) {
         info[1]++;
@@ -177,7 +305,7 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
         if (want < 1e-12 * dt || ++failed > 60) { failed_at = n + 1; goto out; }
         continue;
       }
-      if (SX && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, &c, Ms, &hfac_s, force, n)) { failed_at = n + 1; goto out; }
+      if (nc && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, &c, Ms, &hfac_s, force, n)) { failed_at = n + 1; goto out; }
       memcpy(x, xn, NX * sizeof(double));
       info[0]++;
       double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
@@ -185,9 +313,8 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       at = last ? t[n + 1] : at + h;
     }
     memcpy(X + (size_t)(n + 1) * NX, x, NX * sizeof(double));
-    if (SX) columns_out_(&c, SX + (SY ? 0 : (n + 1) * block));
-    if (SY) observe(0, 1, t + n + 1, u1, p, w, X + (size_t)(n + 1) * NX, SX, nc, 0, 0, Y + (size_t)(n + 1) * NY,
-                    SY + (size_t)(n + 1) * NY * nc, own);
+    if (SX) columns_out_(&c, SX + (n + 1) * block);
+    if (SY) look_(0, t[n + 1], u1, p, w, x, c.S, LANES, NX * LANES, nc, 0, 0, Y + (size_t)(n + 1) * NY, SY + (size_t)(n + 1) * NY * nc, own);
   }
 out:
   unflush_(mode);

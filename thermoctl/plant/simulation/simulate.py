@@ -372,7 +372,7 @@ class Model:
         x0, s0 = self.start(excitation, p, dx0)
         x = np.empty((n, nx))
         at_once = sensitivities and not states and self._at_once
-        dx = _buffer(buffers, _own("dx"), (1 if at_once else n, nx, nq)) if sensitivities else None
+        dx = _buffer(buffers, _own("dx"), (n, nx, nq)) if sensitivities and not at_once else None
         y, dy = self._outputs(excitation, nq, buffers) if at_once else (None, None)
         info = np.zeros(2)
         if nx:
@@ -387,7 +387,9 @@ class Model:
             )
             atol = rtol * scale
             start = (n, excitation.t, u, excitation.linear, p, width, x0, s0)
-            failed = _call(lib.integrate, *start, nq, rtol, atol, MAX_STEPS, x, dx, info, None, y, dy, 1)
+            failed = _call(
+                lib.integrate, *start, nq * sensitivities, rtol, atol, MAX_STEPS, x, dx, info, None, y, dy, 1
+            )
             if failed:
                 at = max(failed - 1, 0)
                 raise SimulationError(
@@ -399,7 +401,7 @@ class Model:
         if self.code.fmus and not np.isfinite(y).all():
             row = int(np.argmin(np.isfinite(y).all(axis=1)))
             raise SimulationError(f"{excitation.name}: the FMU has no output at t = {excitation.t[row]:g} s")
-        return Simulation(excitation.t, x, y, None if at_once else dx, dy, int(info[0]), int(info[1]))
+        return Simulation(excitation.t, x, y, dx, dy, int(info[0]), int(info[1]))
 
     @property
     def _at_once(self) -> bool:
@@ -442,7 +444,7 @@ class Model:
         force = _Forces(len(rows), rows.ctypes.data, cols.ctypes.data, q.ctypes.data)
         x, s0, info = np.empty((n, nx)), np.zeros((nx, columns)), np.zeros(2)
         at_once = self._at_once
-        dx = _buffer(buffers, _own("dx"), (1 if at_once else n, nx, columns))
+        dx = None if at_once else _buffer(buffers, _own("dx"), (n, nx, columns))
         y, dy = self._outputs(excitation, columns, buffers, _own("dy")) if at_once else (None, None)
         atol = rtol * excitation.scale
         start = (n, excitation.t, u, excitation.linear, p, excitation.width, x0, s0)
