@@ -229,7 +229,7 @@ outputs: {speed: {value: v}, y: {value: x}}"""
     d = model.excitation(Table("jump", "jump", t, {"P": push * np.cos(0.7 * t)}))
     found, exact = model.run(d).y, model.run(dataclasses.replace(d, rtol=1e-11)).y
     assert np.ptp(np.sign(exact[:, 0])) == 2
-    np.testing.assert_allclose(found / np.ptp(exact, axis=0), exact / np.ptp(exact, axis=0), atol=2e-4)
+    np.testing.assert_allclose(found / np.ptp(exact, axis=0), exact / np.ptp(exact, axis=0), atol=1e-5)
 
 
 @pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -46,7 +46,6 @@ def _compiler() -> tuple[list[str], str]:
                 "-fno-math-errno",
                 "-fno-trapping-math",
                 "-fPIC",
-                "-shared",
                 "-w",
             ]
             return command, f"{version}{flags}{command}"
@@ -71,48 +70,64 @@ def cache_directory() -> Path:
     )
 
 
-def library(source: str, folders: Sequence[Path] = (), key: str = "") -> ctypes.CDLL:
+def library(source: str, folders: Sequence[Path] = (), key: str = "", beside: str = "") -> ctypes.CDLL:
     """Return C source as a loaded library, compiled once a machine. Raises InputError.
 
-    `folders`: those of its headers; `key`: the headers' text, or other text that the content depends on."""
-    key = hashlib.sha256((source + key + _compiler()[1]).encode()).hexdigest()[:32]
-    folder = cache_directory()
-    path = folder / f"{key}.so"
-    if not path.exists():
-        try:
+    `folders`: those of its headers; `key`: the headers' text, or other text that the content depends on.
+    `beside`: more source, compiled once for all libraries that contain it, on its own."""
+    return ctypes.CDLL(str(_built(source, folders, key, beside, ".so")))
+
+
+def _built(source: str, folders: Sequence[Path], key: str, beside: str, suffix: str) -> Path:
+    """Return the cached file of a library (.so) or an object (.o), made if it is missing."""
+    name = hashlib.sha256((source + beside + key + _compiler()[1]).encode()).hexdigest()[:32]
+    objects = None
+    for folder in _folders():
+        path = folder / f"{name}{suffix}"
+        if path.exists():
+            return path
+        if objects is None:
+            objects = [_built(beside, folders, key, "", ".o")] if beside else []
+        with contextlib.suppress(OSError):  # a read-only home: the next folder
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.TemporaryDirectory(dir=folder) as work:
-                _build(Path(work), source, folders)
-                move(Path(work) / "plant.so", path)
-        except OSError:  # a read-only home: build for this process only
-            with tempfile.TemporaryDirectory() as work:
-                _build(Path(work), source, folders)
-                return ctypes.CDLL(str(Path(work) / "plant.so"))
-        if key[0] == "0":  # only one build in sixteen: listing a full folder takes half a second
-            _trim(folder)
-    return ctypes.CDLL(str(path))
-
-
-def _build(work: Path, source: str, folders: Sequence[Path]) -> None:
-    (work / "plant.c").write_text(source)
-    done = subprocess.run(
-        [
-            *_compiler()[0],
-            *(f"-I{f}" for f in folders),
-            "-o",
-            str(work / "plant.so"),
-            str(work / "plant.c"),
-            "-lm",
-        ],
-        capture_output=True,
-        text=True,
+            _build(path, source, folders, objects)
+            if name[0] == "0":  # only one build in sixteen: listing a full folder takes half a second
+                _trim(folder)
+            return path
+    raise InputError(
+        f"{cache_directory()} and the temporary folder cannot be written: no room for a plant's code"
     )
-    if done.returncode:
-        raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
+
+
+def _folders() -> Iterator[Path]:
+    """Yield the cache, then a folder that goes with this process."""
+    yield cache_directory()
+    yield Path(_own_folder().name)
+
+
+@cache
+def _own_folder() -> tempfile.TemporaryDirectory[str]:
+    """Return a folder that goes with this process."""
+    return tempfile.TemporaryDirectory()
+
+
+def _build(path: Path, source: str, folders: Sequence[Path], objects: Sequence[Path]) -> None:
+    """Compile C source to a library or an object; a file that another process made meanwhile is replaced."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as work:
+        text, made = Path(work) / "plant.c", Path(work) / path.name
+        text.write_text(source)
+        kind = ["-shared", *map(str, objects), "-lm"] if path.suffix == ".so" else ["-c"]
+        command = [*_compiler()[0], *(f"-I{f}" for f in folders), "-o", str(made), str(text), *kind]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
+        move(made, path)
 
 
 def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
-    """Delete the oldest beyond `keep`, but none made within a day: a process may be about to load it."""
+    """Delete the oldest libraries beyond `keep`.
+
+    None made within a day: a process may be about to load it."""
     made = []
     for path in folder.glob("*.so"):
         with contextlib.suppress(OSError):  # another process trims, too

@@ -27,12 +27,9 @@ from thermoctl.plant.native.build import library
 from thermoctl.plant.native.fmu import opened
 from thermoctl.plant.simulation.equations import ARGUMENTS, PRELUDE, Equations, ints, sparse_lu
 
-_HEADERS = tuple(Path(__file__).with_name(h) for h in ("esdirk.h", "integrator.h"))
+_HEADERS = tuple(Path(__file__).with_name(h) for h in ("compiled.h", "esdirk.h", "integrator.h"))
 _LOCK = threading.Lock()
 _LOADED: dict[str, Code] = {}
-_LANES = """/* Columns of sensitivities, eight at a time. */
-typedef double lanes __attribute__((vector_size(64), aligned(8)));
-"""
 
 
 class Code(Equations):
@@ -43,9 +40,11 @@ class Code(Equations):
     def __init__(self, plant: Plant, active: tuple[str, ...], stepper: bool = False):
         super().__init__(plant)
         self.active = active
-        self.source = "#define STEPPER\n" * stepper + self._source()
+        self.source = self._source()
+        integrator = f"#define NX {len(self.states)}\n#define LINEAR {int(self.linear)}\n"
+        integrator += "#define STEPPER\n" * stepper + '#include "integrator.h"\n'
         headers = "".join(path.read_text() for path in _HEADERS)
-        self.library = _typed(library(self.source, [_HEADERS[0].parent], headers))
+        self.library = _typed(library(self.source, [_HEADERS[0].parent], headers, integrator))
         for number, path in enumerate(self.fmus):
             opened(path).link(self.library, number)
 
@@ -61,7 +60,7 @@ class Code(Equations):
         return total
 
     def _source(self) -> str:
-        nx, na = len(self.states), len(self.active)
+        nx = len(self.states)
         jac = self.jacobian()
         sens = [
             (i, c, d)
@@ -84,37 +83,43 @@ class Code(Equations):
                 ]
                 entries += [(r, 2, k, d) for k, s in enumerate(extra) if (d := derivative(g, s)) is not ZERO]
             lists.append((values, entries))
-        lu, lu_lanes, nm = sparse_lu(nx, [(i, k) for i, k, _ in jac])
+        lu, lu_lanes, nm = sparse_lu(nx, [(i, k) for i, k, _ in jac], "")
         args = ARGUMENTS
+        sizes = {
+            "NU": len(self.inputs),
+            "NY": len(self.outputs),
+            "ND": len(delays),
+            "NJ": len(jac),
+            "NV": len(sens),
+            "NM": nm,
+            "NO0": len(lists[0][1]),
+            "NO1": len(lists[1][1]),
+        }
         parts = [
-            f"#define NX {nx}\n#define NU {len(self.inputs)}\n#define NA {na}\n#define NY {len(self.outputs)}\n"
-            f"#define ND {len(delays)}\n#define NJ {len(jac)}\n#define NV {len(sens)}\n#define NM {nm}\n"
-            f"#define NO0 {len(lists[0][1])}\n#define NO1 {len(lists[1][1])}\n"
-            f"#define NO {max(len(lists[0][1]), len(lists[1][1]))}\n#define LINEAR {int(self.linear)}\n",
             PRELUDE,
             *self._declared(),
-            _LANES,
-            ints("J_ROW", [i for i, _, _ in jac]),
-            ints("J_COL", [k for _, k, _ in jac]),
-            ints("V_ROW", [i for i, _, _ in sens]),
-            ints("V_COL", [c for _, c, _ in sens]),
+            '#include "compiled.h"',
+            f"const int {', '.join(f'{k} = {v}' for k, v in sizes.items())};",
+            ints("J_ROW", [i for i, _, _ in jac], ""),
+            ints("J_COL", [k for _, k, _ in jac], ""),
+            ints("V_ROW", [i for i, _, _ in sens], ""),
+            ints("V_COL", [c for _, c, _ in sens], ""),
             *(
-                ints(f"O{o}_ROW", [e[0] for e in lists[o][1]])
-                + ints(f"O{o}_KIND", [e[1] for e in lists[o][1]])
-                + ints(f"O{o}_COL", [e[2] for e in lists[o][1]])
+                ints(f"O{o}_{what}", [e[at] for e in lists[o][1]], "")
                 for o in (0, 1)
+                for at, what in enumerate(("ROW", "KIND", "COL"))
             ),
-            f"static void rhs_{args}, double *out) {{\n{self.emit(self.slopes)}}}\n",
-            f"static void jac_{args}, double *out) {{\n{self.emit([d for *_, d in jac])}}}\n",
-            f"static void sens_{args}, double *out) {{\n{self.emit([d for *_, d in ([] if self.linear else jac) + sens])}}}\n",
+            f"void rhs_{args}, double *out) {{\n{self.emit(self.slopes)}}}\n",
+            f"void jac_{args}, double *out) {{\n{self.emit([d for *_, d in jac])}}}\n",
+            f"void sens_{args}, double *out) {{\n{self.emit([d for *_, d in ([] if self.linear else jac) + sens])}}}\n",
         ]
         for (values, entries), fn in zip(lists, ("outputs_", "delayed_"), strict=True):
             parts += [
-                f"static void {fn}{args}, const double *d, double *out) {{\n{self.emit(values)}}}\n",
-                f"static void {fn[:-1]}_slopes_{args}, const double *d, double *out) {{\n"
+                f"void {fn}{args}, const double *d, double *out) {{\n{self.emit(values)}}}\n",
+                f"void {fn[:-1]}_slopes_{args}, const double *d, double *out) {{\n"
                 f"{self.emit([e[3] for e in entries])}}}\n",
             ]
-        return "\n".join([*parts, lu, lu_lanes, _product(jac), '#include "integrator.h"\n'])
+        return "\n".join([*parts, lu, lu_lanes, _product(jac)])
 
     def _declared(self) -> list[str]:
         """Return the C that declares the functions of FMUs; their contents are part of the source's key."""
@@ -133,7 +138,7 @@ def _product(jac: Sequence[tuple[int, int, Expr]]) -> str:
     for q, (i, k, _) in enumerate(jac):
         rows.setdefault(i, []).append(f"J[{q}] * R[{k}]")
     text = "".join(f"k[{i}] += {' + '.join(terms)};\n" for i, terms in rows.items())
-    return f"static inline void multiply_lanes_(const double *J, const lanes *R, lanes *restrict k) {{ (void)J; (void)R; (void)k;\n{text}}}\n"
+    return f"void multiply_lanes_(const double *J, const lanes *R, lanes *restrict k) {{ (void)J; (void)R; (void)k;\n{text}}}\n"
 
 
 # ------------------------------------------------------------------------------------------------------

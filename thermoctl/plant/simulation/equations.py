@@ -240,10 +240,10 @@ _ELIMINATION = """for (const int *f = FACTORS, *end = f + sizeof FACTORS / sizeo
 """
 
 
-def ints(label: str, values: Iterable[int]) -> str:
+def ints(label: str, values: Iterable[int], linkage: str = "static ") -> str:
     """Return a C array of integers; an empty one holds a 0, as C wants at least one."""
     values = list(values)
-    return f"static const int {label}[] = {{{', '.join(map(str, values or [0]))}}};"
+    return f"{linkage}const int {label}[] = {{{', '.join(map(str, values or [0]))}}};"
 
 
 Pivots = list[tuple[int, list[tuple[int, list[tuple[int, int]]]]]]
@@ -269,7 +269,7 @@ def _factors(pivots: Pivots) -> tuple[str, str]:
     return ints("FACTORS", numbers) + "\n", _ELIMINATION
 
 
-def sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, str, int]:
+def sparse_lu(n: int, pattern: list[tuple[int, int]], linkage: str = "static ") -> tuple[str, str, int]:
     """Write C that factors M = I - a J and solves for one and for eight right-hand sides.
 
     No pivoting, minimum-degree order (Markowitz). A small pivot is refused; the integrator then takes a
@@ -309,11 +309,11 @@ def sparse_lu(n: int, pattern: list[tuple[int, int]]) -> tuple[str, str, int]:
         f"r[{k}] *= M[{m}];\n" if j < 0 else f"r[{k}] -= M[{m}] * r[{j}];\n" for k, j, m in backward
     )
     table, factors = _factors(pivots)
-    lanes = f"static inline void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n"
+    lanes = f"{linkage}void solve_lanes_(const double *restrict M, lanes *restrict r) {{ (void)M; (void)r;\n{single}}}\n"
     return (
-        f"{table}static int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}"
+        f"{table}{linkage}int factor_(double a, const double *J, double *M) {{ (void)a; (void)J;\n{''.join(put)}"
         f"{factors}return 1; }}\n"
-        f"static void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n",
+        f"{linkage}void solve_(const double *M, double *r) {{ (void)M; (void)r;\n{single}}}\n",
         lanes,
         len(index),
     )

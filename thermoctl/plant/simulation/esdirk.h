@@ -22,7 +22,7 @@ static const double BHAT[STAGES] = {4586570599.0 / 29645900160.0, 0, 178811875.0
                                     -3700637.0 / 11593932, 61727.0 / 225920};
 
 static void inputs_at(double s, const double *u0, const double *u1, const int *lin, double *u) {
-  for (int j = 0; j < NU; j++) u[j] = lin[j] && u1 ? u0[j] + s * (u1[j] - u0[j]) : u0[j];
+  for (int j = 0; j < NU; j++) u[j] = u1 && lin[j] ? u0[j] + s * (u1[j] - u0[j]) : u0[j];
 }
 
 static double norm_(const double *e, const double *x, const double *xn, double rtol, const double *atol) {

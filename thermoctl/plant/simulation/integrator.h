@@ -1,10 +1,11 @@
-/* The integrator behind every compiled plant. The generated file defines the sizes, the pattern of the Jacobian and the
-   functions rhs_, jac_, sens_, factor_, solve_, solve_lanes_ and includes this file.
+/* The integrator behind every compiled plant, compiled once for all plants of NX states, LINEAR or not, and linked to the
+   equations of each (compiled.h).
 
    Inputs change at each sample, so that most steps are far shorter than accuracy needs: an explicit step is tried first, and
    esdirk.h takes those where its error does not pass or the plant is stiff. Sensitivities S = dx/dq are the exact derivative
    of the step that was taken; of ESDIRK's
        (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
+#include "compiled.h"
 #include "esdirk.h"
 
 /* Numbers below 2e-308 become 0 in a run. The sensitivity to a start decays; it would stay at the last such number for ever
@@ -32,7 +33,6 @@ typedef struct { int count; const int *row, *col; const double *q; } Forces;
 
 /* The columns of S go through a step LANES at a time, in the processor's registers. Entries V of F_p belong to columns: `entry`
    lists them by group of lanes, those of group g from begin[g] on, and `slot` their places in the group's (NX, LANES). */
-#define LANES 8
 typedef struct { int nc, groups, count, *begin, *entry, *slot; double *JV, *S; } Columns;
 
 static int columns_(Columns *c, int nc, const double *S0, const Forces *force) {
@@ -78,6 +78,17 @@ static double *tangents_(double t, double part, const double *u, const double *p
   return V;
 }
 
+/* The entries V of a group of lanes, at each of so many points of a step, in their places: F[s] is (NX, LANES). Made a group ahead: a
+   vector that is read right after one of its numbers was written keeps a processor waiting. */
+static void place_(const Columns *c, int points, int g, lanes F[][NX + 1]) {
+  if (g >= c->groups) return;
+  for (int s = 0; s < points; s++) {
+    const double *V = c->JV + (size_t)s * (NJ + c->count) + NJ;
+    memset(F[s], 0, sizeof F[s]);
+    for (int e = c->begin[g]; e < c->begin[g + 1]; e++) ((double *)F[s])[c->slot[e]] += V[c->entry[e]];
+  }
+}
+
 /* The sensitivities over the step that try_step accepted; c->S is advanced in place. Ms: the stages' factors. */
 static int sens_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
                      const double *p, const double *w, const double *xs, Columns *c, double *Ms, double *hfac, const Forces *force, int n) {
@@ -92,20 +103,18 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
       if (LINEAR) *hfac = h;
     }
   }
+  lanes F[2][STAGES][NX + 1];
+  place_(c, STAGES, 0, F[0]);
   for (int g = 0; g < c->groups; g++) {
     lanes K[STAGES][NX + 1], R[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
-    double F[(NX + 1) * LANES];
     const double back = 1 / (h * G);
-    const int first = c->begin[g], last = c->begin[g + 1];
-    memset(F, 0, sizeof F);
+    place_(c, STAGES, g + 1, F[(g + 1) % 2]);
     for (int s = 0; s < STAGES; s++) {
-      const double *V = c->JV + (size_t)s * (NJ + c->count) + NJ, *J0 = c->JV;
-      for (int e = first; e < last; e++) F[c->slot[e]] += V[c->entry[e]];
       lanes *const k = K[s];
-      const lanes *const f = (const lanes *)F;
+      const lanes *const f = F[g % 2][s];
       if (s == 0) {
         for (int i = 0; i < NX; i++) k[i] = f[i];
-        multiply_lanes_(J0, S, k);
+        multiply_lanes_(c->JV, S, k);
       } else {
         const double a0 = h * A_[s][0], a1 = h * A_[s][1], a2 = h * A_[s][2], a3 = h * A_[s][3], a4 = h * A_[s][4];
         switch (s) {
@@ -120,20 +129,19 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
         if (s == STAGES - 1) for (int i = 0; i < NX; i++) S[i] = k[i];
         else for (int i = 0; i < NX; i++) k[i] = (k[i] - R[i]) * back;
       }
-      for (int e = first; e < last; e++) F[c->slot[e]] = 0;
     }
   }
   return 1;
 }
 
 /* Explicit steps of order 4: the classical method, with Zonneveld's fifth point for an error of order 3 (Hairer, Norsett, Wanner,
-   Solving ODEs I, sec. II.4; a quarter of the difference, still far above the error). No weight of it is small: a jump between
+   Solving ODEs I, sec. II.4; a sixteenth of the difference, still above the error). No weight of it is small: a jump between
    any two points shows. */
 #define POINTS 4
 static const double RC_[POINTS + 1] = {0, 0.5, 0.5, 1, 0.75}, RB_[POINTS] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
 static const double RA_[POINTS] = {5.0 / 32, 7.0 / 32, 13.0 / 32, -1.0 / 32};
-static const double RE_[POINTS + 1] = {1.0 / 6, -0.5, -0.5, -0.5, 4.0 / 3};
-#define SHORT 0.2        /* of what is left to the next sample: where explicit steps are shorter, ESDIRK takes the next ones */
+static const double RE_[POINTS + 1] = {1.0 / 24, -0.125, -0.125, -0.125, 1.0 / 3};
+#define SHORT 0.2        /* of a step that the error allows: where explicit steps have to be shorter, ESDIRK takes the next ones */
 #define STEEP 0.5        /* largest step times a bound of the eigenvalues; a state at rest passes any longer step, its slopes grow */
 #define LONGEST_WAIT 16  /* steps of ESDIRK before the next explicit try: 1, doubled with each failure */
 
@@ -155,8 +163,20 @@ static double steepest_(const double *J, double h, double *z) {
   return bound;
 }
 
+/* Whether slopes differ by more than 4 STEEP / h times the states that they belong to: dry friction that sticks, about which explicit
+   steps would go to and fro, where it slides through a reversal they do not. */
+static int sticks_(double h, const double *k0, const double *k1, const double *x0, const double *x1, const double *z, const double *atol) {
+  double slope = 0, way = 0;
+  for (int i = 0; i < NX; i++) {
+    const double d = h * fabs(k1[i] - k0[i]);
+    if (d > 1e-2 * atol[i]) slope = fmax(slope, d / z[i]);
+    way = fmax(way, fabs(x1[i] - x0[i]) / z[i]);
+  }
+  return slope > 4 * STEEP * way;
+}
+
 /* One explicit step of at most *h, which becomes the step that STEEP allows. xs: states at the points; z: as of steepest_, whose
-   last bound is *steep (below 0: none yet). Returns the norm of the error, or -1 where *h falls below `least`. */
+   last bound is *steep (below 0: none yet). Returns the norm of the error, or -1 where the step would fall below `least` or sticks. */
 static double try_explicit(double t, double *h, double least, double ta, double dt, const double *u0, const double *u1, const int *lin,
                            const double *p, const double *w, const double *x, double rtol, const double *atol,
                            double *xs, double *xn, double *z, double *steep) {
@@ -175,6 +195,7 @@ static double try_explicit(double t, double *h, double least, double ta, double 
     } else if (s < POINTS) for (int i = 0; i < NX; i++) X[i] = x[i] + *h * RC_[s] * k[s - 1][i];
     else for (int i = 0; i < NX; i++) X[i] = x[i] + *h * (RA_[0] * k[0][i] + RA_[1] * k[1][i] + RA_[2] * k[2][i] + RA_[3] * k[3][i]);
     rhs_(ts, X, u, p, w, k[s]);
+    if (!LINEAR && (s == 1 || s == 3) && sticks_(*h, k[s - 1], k[s], X - NX, X, z, atol)) return -1;
   }
   for (int i = 0; i < NX; i++) {
     xn[i] = x[i] + *h * (RB_[0] * k[0][i] + RB_[1] * k[1][i] + RB_[2] * k[2][i] + RB_[3] * k[3][i]);
@@ -195,17 +216,19 @@ static int sens_explicit(double t, double h, double ta, double dt, const double 
     if (LINEAR && !s) jac_(ts, xs, u, p, w, c->JV);
     if (!LINEAR && s && !(h / 4 * steepest_(J, h / 4, own) <= STEEP)) return 0;
   }
+  lanes F[2][POINTS][NX + 1];
+  place_(c, POINTS, 0, F[0]);
   for (int g = 0; g < c->groups; g++) {
-    lanes k[NX + 1], R[NX + 1], sum[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
+    lanes R[NX + 1], sum[NX + 1], *S = (lanes *)(c->S + (size_t)g * NX * LANES);
+    place_(c, POINTS, g + 1, F[(g + 1) % 2]);
     for (int s = 0; s < POINTS; s++) {
-      const double *j = c->JV + (LINEAR ? 0 : (size_t)s * (NJ + c->count)), *V = c->JV + (size_t)s * (NJ + c->count) + NJ;
-      for (int i = 0; i < NX; i++) R[i] = s ? S[i] + h * RC_[s] * k[i] : S[i];
-      memset(k, 0, sizeof k);
-      for (int e = c->begin[g]; e < c->begin[g + 1]; e++) ((double *)k)[c->slot[e]] += V[c->entry[e]];
-      multiply_lanes_(j, R, k);
-      for (int i = 0; i < NX; i++) sum[i] = s ? sum[i] + h * RB_[s] * k[i] : h * RB_[0] * k[i];
+      lanes *const k = F[g % 2][s];
+      multiply_lanes_(c->JV + (LINEAR ? 0 : (size_t)s * (NJ + c->count)), s ? R : S, k);
+      const double a = h * RB_[s], b = s + 1 < POINTS ? h * RC_[s + 1] : 0;
+      if (s) for (int i = 0; i < NX; i++) sum[i] += a * k[i]; else for (int i = 0; i < NX; i++) sum[i] = S[i] + a * k[i];
+      if (b) for (int i = 0; i < NX; i++) R[i] = S[i] + b * k[i];
     }
-    for (int i = 0; i < NX; i++) S[i] += sum[i];
+    memcpy(S, sum, NX * sizeof(lanes));
   }
   return 1;
 }
@@ -224,7 +247,7 @@ static void look_(int o, double t, const double *u, const double *p, const doubl
                   int step, int nc, const double *d, const double *sd, double *y, double *sy, int own) {
   if (o) delayed_(t, x, u, p, w, d, y); else outputs_(t, x, u, p, w, d, y);
   if (!sy) return;
-  double V[NO + 1];
+  double V[(NO0 > NO1 ? NO0 : NO1) + 1];
   const int ny = o ? ND : NY, count = o ? NO1 : NO0, *row = o ? O1_ROW : O0_ROW, *kind = o ? O1_KIND : O0_KIND, *col = o ? O1_COL : O0_COL;
   if (o) delayed_slopes_(t, x, u, p, w, d, V); else outputs_slopes_(t, x, u, p, w, d, V);
   for (int r = 0, q = 0; r < ny; r++, sy += nc) {                  /* of a row's entries those by states come first */
@@ -277,9 +300,10 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       if (++steps > max_steps) { failed_at = n + 1; goto out; }
       double h = reach <= 0 || reach > left ? left : left / ceil(left / reach);
       if (skip) skip--;
-      else if (h >= left * SHORT) {
-        double err = try_explicit(at, &h, left * SHORT, ta, dt, u0, u1, lin, p, w, x, rtol, atol, xs, xn, z, &steep);
-        double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-3), -0.25));
+      else {
+        const double wished = h;
+        double err = try_explicit(at, &h, wished * SHORT, ta, dt, u0, u1, lin, p, w, x, rtol, atol, xs, xn, z, &steep);
+        double grow = h * fmin(8, 0.9 * pow(fmax(err, 1e-4), -0.25));
         if (err >= 0 && err <= 1 && (!nc || sens_explicit(at, h, ta, dt, u0, u1, lin, p, w, xs, z, &c, force, n))) {
           memcpy(x, xn, NX * sizeof(double));
           info[0]++;
@@ -288,7 +312,8 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
           wait = 1;
           continue;
         }
-        if (err > 1 && err < 1e9 && grow >= left * SHORT) { reach = grow; info[1]++; continue; }
+        if (err > 1 && err < 1e9 && grow > 1e-9 * dt) { reach = grow; info[1]++; continue; }
+        if (wished < left) want = want <= 0 ? wished : fmin(want, wished);
         skip = wait;
         if (wait < LONGEST_WAIT) wait *= 2;
       }
@@ -337,8 +362,7 @@ void slopes(int N, const double *t, const double *U, const double *p, const doub
    memory: [0] h of the matrix (0: none), [1] steps to wait before the next try, [2] matrices made, then J, then h phi1(h J)
    by columns. */
 #define GLIDE_MAX 48
-#define MEMORY (3 + NJ + NX * NX)
-const int memory_size = MEMORY;
+int memory_size(void) { return 3 + NJ + NX * NX; }
 
 #if NX > 0 && NX <= GLIDE_MAX
 static void product_(const double *A, const double *B, double *out) {     /* by columns; out is neither */
@@ -413,8 +437,7 @@ static int glide(double t, double h, const double *u, const double *p, const dou
 /* One period with inputs held; x in place, y out. Returns 0 or 1. (Static: glibc has a symbol named advance.) */
 static int period_(double t, double h, const double *u, const double *p, const double *w, double rtol, const double *atol,
                    double *x, double *y, double *want) {
-  static const int hold[NU + 1];
-  if (advance_states_(t, h, u, 0, hold, p, w, rtol, atol, x, want)) return 1;
+  if (advance_states_(t, h, u, 0, 0, p, w, rtol, atol, x, want)) return 1;
   outputs_(t + h, x, u, p, w, 0, y);
   return 0;
 }

@@ -593,8 +593,9 @@ class Stepper:
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
         self._scale = np.abs(self.x) * 1e-2 + 1e-3
         self._atol = self.rtol * self._scale
-        size = ctypes.c_int.in_dll(self._library, "memory_size").value
-        self._memory = np.zeros(size)  # the matrix of the exponential method, see integrator.h
+        self._memory = np.zeros(
+            self._library.memory_size()
+        )  # the matrix of the exponential method, see integrator.h
         tail = (self._atol, self.x, self._y, self._want, self._memory)
         self._pointers = tuple(
             [a.ctypes.data for a in part] for part in ((self._u, self._p, self._width), tail)
