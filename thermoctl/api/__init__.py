@@ -116,7 +116,7 @@ def check(plant: Plant | str | Path, data: Data | Sequence[Data]) -> list[Findin
 
 
 def __getattr__(name: str) -> Any:
-    """Return `diagnose` or `Diagnosis`, which load the whole diagnosis. Raises AttributeError for others."""
+    """Return `diagnose` or `Diagnosis`, which load the diagnosis. Raises AttributeError for other names."""
     if name not in ("Diagnosis", "diagnose"):
         raise AttributeError(f"module 'thermoctl.api' has no attribute '{name}'")
     return getattr(importlib.import_module("thermoctl.api.diagnosing"), name)

@@ -298,9 +298,10 @@ class SocketSettings:
 class Settings:
     """A whole configuration; `path` is the file it came from, `channels` those of its points.
 
-    A rig file with `axes` gives two kinds. Those of one axis are what a rig without axes has; `axis` is its
-    name, `rig_socket` the rig's socket. Those of the whole rig have `axes`, and the channels of all axes.
-    Their sections `control`, `compensation` and `protection` are the first axis'.
+    A rig file with `axes` gives two kinds of settings. The settings of one axis have the same fields as
+    those of a rig without axes; `axis` is its name, `rig_socket` the rig's socket. The settings of the whole
+    rig have `axes` and the channels of all axes. Their sections `control`, `compensation` and `protection`
+    are those of the first axis.
     """
 
     path: str

@@ -118,14 +118,14 @@ def diagnose(args: argparse.Namespace) -> int:
         return _run(args, plant, [*given, *added], held_out)
 
     try:
-        found = _resolved(args, diagnosed) if args.resolve else diagnosed(args.recordings)
+        result = _resolved(args, diagnosed) if args.resolve else diagnosed(args.recordings)
     except KeyboardInterrupt:
         print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
         raise
     if args.json:
-        print(json.dumps(found, indent=1, allow_nan=False))
+        print(json.dumps(result, indent=1, allow_nan=False))
     elif not args.quiet:
-        summary(found, args.out)
+        summary(result, args.out)
     return 0
 
 
@@ -161,10 +161,10 @@ def _resolved(
     return resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
 
 
-def parsed_limits(told: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parsed_limits(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Return the range of each NAME=LOW:HIGH. Raises InputError."""
     out = {}
-    for text in told:
+    for text in texts:
         name, _, span = text.partition("=")
         low, _, high = span.partition(":")
         try:
@@ -190,31 +190,31 @@ def save_law(args: argparse.Namespace) -> int:
     return 0
 
 
-def summary(found: dict[str, Any], out: str | Path) -> None:
+def summary(result: dict[str, Any], out: str | Path) -> None:
     """Print a result for a person."""
     console = Console() if sys.stdout.isatty() else Console(width=160)
-    console.print(f"[bold]{found['verdict'].replace('_', ' ')}[/].", end=" ")
-    console.print(" ".join(sentences(found)), markup=False)
-    if found["findings"]:
+    console.print(f"[bold]{result['verdict'].replace('_', ' ')}[/].", end=" ")
+    console.print(" ".join(sentences(result)), markup=False)
+    if result["findings"]:
         rows = []
-        for f in found["findings"]:
+        for f in result["findings"]:
             first = (f["effect"], f["where"], figures.equation(f))
             for row in figures.parameter_rows(f)[1]:
                 rows.append((*first, *row))
                 first = ("", "", "")
         _print(console, (("effect", "where", "equation", "parameter", "value, 95 %", "unit"), rows))
-    _print(console, figures.alternative_rows(found))
-    _print(console, figures.error_rows(found))
-    lines = [f"note: {note}" for note in figures.merged(found["notes"])]
-    if found["next_experiment"]:
-        lines += _next_experiment(found["next_experiment"], Path(out))
+    _print(console, figures.alternative_rows(result))
+    _print(console, figures.error_rows(result))
+    lines = [f"note: {note}" for note in figures.merged(result["notes"])]
+    if result["next_experiment"]:
+        lines += _next_experiment(result["next_experiment"], Path(out))
     lines += [
         f"round {k}: was {r['verdict']}; ran {r['experiment']} -> {r['recording']}"
-        for k, r in enumerate(found.get("resolved", ()), 1)
+        for k, r in enumerate(result.get("resolved", ()), 1)
     ]
-    lines.append(f"what next: {what_next(found)}")
+    lines.append(f"what next: {what_next(result)}")
     lines.append(
-        f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json ({found['seconds']:.0f} s)"
+        f"written: {Path(out) / 'report.html'}, plant.yaml, diagnosis.json ({result['seconds']:.0f} s)"
     )
     for line in lines:
         console.print(line, markup=False)

@@ -56,11 +56,11 @@ def curves_of(
     plant: Plant, drives: Sequence[Excitation], errors: Mapping[str, Sequence[np.ndarray]], held_out: bool
 ) -> Iterator[Curve]:
     """Yield a curve for each measured output of each recording, with the errors that are known."""
-    known = {k: e for k, e in errors.items() if len(e)}
+    given = {k: e for k, e in errors.items() if len(e)}
     for r, d in enumerate(drives):
         for j, o in enumerate(plant.outputs.values()):
             seen = np.isfinite(d.y[:, j])  # an outlier has an error, too
-            found = {k: np.where(seen, e[r][:, j], np.nan) for k, e in known.items()}
-            own = {k: e for k, e in found.items() if np.isfinite(e).any()}
+            measured = {k: np.where(seen, e[r][:, j], np.nan) for k, e in given.items()}
+            own = {k: e for k, e in measured.items() if np.isfinite(e).any()}
             if own:
                 yield Curve(d.name, o.name, o.unit, held_out, d.t, d.y[:, j], own)

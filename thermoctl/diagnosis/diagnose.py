@@ -62,9 +62,9 @@ def diagnose(
     Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
     of earlier recordings."""
     say = progress or (lambda text: None)
-    found = sought(plant, tables, entries, numbers, held_out, say, stopped, memory)
+    tried = sought(plant, tables, entries, numbers, held_out, say, stopped, memory)
     say("measuring what the findings are worth")
-    return decided(found)
+    return decided(tried)
 
 
 def sought(
@@ -87,10 +87,12 @@ def sought(
 
 def decided(sought: Sought) -> Diagnosis:
     """Decide a search: posterior, findings and their worth, remainder, verdict, missing flow."""
-    found = _decided(sought)
-    if found.decision.verdict != "consistent" and not found.shown and found.before.node:
-        found = replace(found, missing_flow=missing_flow(sought.case, found.null, found.before.node))
-    return found
+    diagnosis = _decided(sought)
+    if diagnosis.decision.verdict != "consistent" and not diagnosis.shown and diagnosis.before.node:
+        diagnosis = replace(
+            diagnosis, missing_flow=missing_flow(sought.case, diagnosis.null, diagnosis.before.node)
+        )
+    return diagnosis
 
 
 def _decided(sought: Sought) -> Diagnosis:
@@ -106,11 +108,11 @@ def _decided(sought: Sought) -> Diagnosis:
     if posterior.something >= numbers.name:
         likeliest = next(keys for keys in posterior.hypotheses if keys)
         stand = supported(likeliest, physics)  # the other effects are part of the remainder
-        found = stand if stand in fits else likeliest
-        kept = found
+        chosen = stand if stand in fits else likeliest
+        kept = chosen
         # beside known physics whose residual is only noise, there is no misfit that it could imitate
-        if reserve or any(key[0] == LAW for key in found) or not only_noise(known, fits[found], numbers):
-            kept, posterior, asked = confirmed(posterior, found, Confirm(known, fits, reserve), numbers.name)
+        if reserve or any(key[0] == LAW for key in chosen) or not only_noise(known, fits[chosen], numbers):
+            kept, posterior, asked = confirmed(posterior, chosen, Confirm(known, fits, reserve), numbers.name)
         best = with_residuals(known, fits[kept]) if kept else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
@@ -118,8 +120,8 @@ def _decided(sought: Sought) -> Diagnosis:
     keys = () if sought.unsure else (e.key for e in best.hypothesis.effects)
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
     # data that took part in the choice cannot speak against it
-    told = bool(best.hypothesis.effects) and value.reserved
-    ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if told else (1.0, 0.0)
+    checked = bool(best.hypothesis.effects) and value.reserved
+    ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if checked else (1.0, 0.0)
     remains = remainder(known, fits[best.hypothesis.keys])
     unknown = Missing()
     if remains < numbers.name:

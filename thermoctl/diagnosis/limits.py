@@ -27,13 +27,13 @@ class Thresholds:
 def limits() -> Thresholds:
     """Read the shipped numbers. Raises InputError where one is missing or not known."""
     root = yamlfile.load(shipped("config") / "diagnosis.yaml")
-    known = {f.name for f in fields(Thresholds)}
+    names = {f.name for f in fields(Thresholds)}
     for key, node in root.value.items():
-        if key not in known:
+        if key not in names:
             raise node.error(
-                f"unknown number '{key}'; known are {', '.join(sorted(known))}{yamlfile.suggest(key, known)}"
+                f"unknown number '{key}'; known are {', '.join(sorted(names))}{yamlfile.suggest(key, names)}"
             )
     values = {key: node.plain()["value"] for key, node in root.value.items()}
-    for key in known - values.keys():
+    for key in names - values.keys():
         raise root.error(f"the number '{key}' is missing")
     return Thresholds(**values)

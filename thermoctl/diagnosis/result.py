@@ -310,7 +310,7 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
     if d.decision.verdict == "consistent":
         return []
     rms = d.null.fit.rms()
-    found = [
+    entries = [
         {
             "channel": o,
             "rms": rms[o],
@@ -324,7 +324,7 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
         for o, ratio in d.before.over_noise.items()
         if ratio > MISFIT
     ]
-    return sorted(found, key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
+    return sorted(entries, key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
 
 
 def _when(d: Diagnosis, output: str) -> list[list[float]]:

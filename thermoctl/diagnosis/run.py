@@ -81,48 +81,52 @@ def diagnose(
             f"{earlier}: holds {', '.join(sorted(again))} already; recordings that it has not seen were expected"
         )
     try:
-        found = engine.diagnose(
+        diagnosis = engine.diagnose(
             plant, chosen_on, catalogue((CATALOGUE, *effects)), numbers(), reserve, progress, stopped, before
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
-    if not (anyway or stopped()) and (wrong := relabelled(found, split(chosen_on, reserve)[0], numbers())):
+    if not (anyway or stopped()) and (
+        wrong := relabelled(diagnosis, split(chosen_on, reserve)[0], numbers())
+    ):
         raise InputError(f"{wrong[0]} (--anyway diagnoses in spite of it)")
-    proposed = None if stopped() else propose(found, drivable, limits, progress)
-    result = contract(found)
+    proposed = None if stopped() else propose(diagnosis, drivable, limits, progress)
+    result = contract(diagnosis)
     result["next_experiment"] = proposed[0] if proposed else None
-    result["trends"] = trends(found.case, found.best, found.shown, sizes)
+    result["trends"] = trends(diagnosis.case, diagnosis.best, diagnosis.shown, sizes)
     result["notes"] += trend_notes(result["trends"])
     if before.recordings:
         result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")
     if stopped():
-        result["notes"].insert(0, STOPPED.format(found.case.budget.fits_done))
-    result["not_seen"] = not_seen(found) if found.decision.verdict == "consistent" and not stopped() else []
+        result["notes"].insert(0, STOPPED.format(diagnosis.case.budget.fits_done))
+    result["not_seen"] = (
+        not_seen(diagnosis) if diagnosis.decision.verdict == "consistent" and not stopped() else []
+    )
     result["seconds"] = round(time.monotonic() - started, 1)
-    _write(folder, plant, found, result, proposed, report)
+    _write(folder, plant, diagnosis, result, proposed, report)
     return result
 
 
 def _write(
-    folder: Path, plant: Plant, found: Diagnosis, result: dict[str, Any], proposed: Any, report: bool
+    folder: Path, plant: Plant, diagnosis: Diagnosis, result: dict[str, Any], proposed: Any, report: bool
 ) -> None:
     """Write all files of a result, or none."""
     with whole_files(folder, remove=experiment_file.FILES) as part:
-        added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in found.shown)
-        save(found.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
+        added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in diagnosis.shown)
+        save(diagnosis.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
         if report:
-            _report(found, result, part / "report.html")
+            _report(diagnosis, result, part / "report.html")
         write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
-        memory.write(part, plant, _remembered(found))
+        memory.write(part, plant, _remembered(diagnosis))
         if proposed:
-            experiment_file.write(part, found.case, *proposed)
+            experiment_file.write(part, diagnosis.case, *proposed)
 
 
-def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
+def _report(diagnosis: Diagnosis, result: dict[str, Any], path: Path) -> None:
     """Write report.html; without matplotlib only the summary, with a note in the result."""
     try:
-        write_report(found, result, path)
+        write_report(diagnosis, result, path)
     except ModuleNotFoundError as e:
         if (line := lacking(e)) is None:
             raise
@@ -131,15 +135,15 @@ def _report(found: Diagnosis, result: dict[str, Any], path: Path) -> None:
         write_text(path, page("Diagnosis", [("", f"<p>{summary}</p>")]))
 
 
-def _remembered(found: Diagnosis) -> memory.Memory:
+def _remembered(diagnosis: Diagnosis) -> memory.Memory:
     """Return the memory for a later diagnosis: the likeliest hypotheses, and the plant without effects."""
     kept = [
         w.fitted
-        for k, w in enumerate(found.searched.tried)
+        for k, w in enumerate(diagnosis.searched.tried)
         if k < memory.KEPT or not w.fitted.hypothesis.effects
     ]
-    names = (*found.case.memory.recordings, *(t.name for t in found.case.tables))
-    return memory.Memory(tuple(remembered(found.case, f) for f in kept), names)
+    names = (*diagnosis.case.memory.recordings, *(t.name for t in diagnosis.case.tables))
+    return memory.Memory(tuple(remembered(diagnosis.case, f) for f in kept), names)
 
 
 def diagnose_files(

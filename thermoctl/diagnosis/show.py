@@ -17,22 +17,22 @@ from thermoctl.files.yamlfile import InputError, suggest
 
 def explained(folder: str, effect: str | None = None) -> int:
     """Print the reasons of a diagnosis, or those of one effect. Raises InputError where there is none."""
-    found = read(Path(folder))
-    print(why(found, effect) if effect else explain(found))
+    result = read(Path(folder))
+    print(why(result, effect) if effect else explain(result))
     return 0
 
 
 def effects(args: argparse.Namespace) -> int:
     """`thermoctl effects [show NAME]`: list the catalogue, or show an entry. Raises InputError."""
-    found = catalogue((CATALOGUE, *map(Path, args.effects or ())))
+    entries = catalogue((CATALOGUE, *map(Path, args.effects or ())))
     console = Console(soft_wrap=True)
     if args.action == "show":
-        if args.name not in found:
+        if args.name not in entries:
             raise InputError(
-                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), found)}; "
+                f"'{args.name}' is not an effect of the catalogue{suggest(str(args.name), entries)}; "
                 "`thermoctl effects` lists them"
             )
-        e = found[args.name]
+        e = entries[args.name]
         console.print(
             f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
             f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
@@ -59,7 +59,7 @@ def effects(args: argparse.Namespace) -> int:
             f"effects: 'show NAME', 'check FILE', 'save DIR NAME' or nothing was expected, not '{args.action}'"
         )
     table = Table("effect", "place", "what it is", box=None, header_style="bold")
-    for e in found.values():
+    for e in entries.values():
         table.add_row(e.name, e.where, e.title)
     console.print(table)
     return 0
@@ -69,14 +69,14 @@ def read(folder: Path) -> dict[str, Any]:
     """Read the result of an earlier diagnosis. Raises InputError."""
     path = folder / "diagnosis.json"
     try:
-        found = json.loads(path.read_text())
+        result = json.loads(path.read_text())
     except OSError:
         raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
     except ValueError as e:
         raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
     if (
-        not isinstance(found, dict)
-        or not {"decision", "hypotheses", "lost", "refused", "promised"} <= found.keys()
+        not isinstance(result, dict)
+        or not {"decision", "hypotheses", "lost", "refused", "promised"} <= result.keys()
     ):
         raise InputError(f"{path}: written by an older version, without its reasons; diagnose again")
-    return found
+    return result

@@ -17,7 +17,7 @@ def _controls() -> list[tuple[Callable[..., int], Callable[..., int]]]:
         if MAPS.exists()
         else set()
     )
-    found = []
+    controls = []
     for file in sorted(files):
         library = ctypes.CDLL(file)
         for prefix in ("", "scipy_"):
@@ -25,8 +25,8 @@ def _controls() -> list[tuple[Callable[..., int], Callable[..., int]]]:
                 get = getattr(library, f"{prefix}openblas_get_num_threads{suffix}", None)
                 put = getattr(library, f"{prefix}openblas_set_num_threads{suffix}", None)
                 if get and put:
-                    found.append((get, put))
-    return found
+                    controls.append((get, put))
+    return controls
 
 
 @contextmanager

@@ -79,5 +79,5 @@ def side_by_side(laws: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def comparisons(laws: Mapping[str, Mapping[str, Any]]) -> Sequence[str]:
-    """Return sentences on the parameters that agree between the laws of several rigs, and that do not."""
+    """Return a sentence for each parameter that laws of several rigs share: do its values agree?"""
     return [s.text for s in shared(laws)]

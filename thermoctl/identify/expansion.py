@@ -12,7 +12,7 @@ least-squares solution for each.
 Ridge: the gains g multiply the noise of the thermometers. Its variance is quantisation step^2/12 plus the
 sensor's own, times (1 - f1)/(1 + f1) after the filter 1/(z - f1). Adding N sigma^2 g'g to the criterion
 minimises the expected squared error *with such inputs*. The 25 nearly collinear parameters need that. The
-time constant itself is not well determined by them; the prediction is.
+time constant itself is not well determined, but the prediction is.
 
 The output moves with the bodies' absolute temperatures, but the model has rises above the air. T_abs = rise +
 air, so air enters with the sum of all gains: b_air = sum(b1 + b2). Two hours of test do not excite a free air

@@ -19,9 +19,9 @@ Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags tha
 A loop without derivative stays without: PI by the half rule, t1 + t2/2 and theta + t2/2.
 
 Margins are those of the sampled loop L(e^jw) = D(z) G(z). G has a zero-order hold, the dead time and the
-moving average. A recording cannot tell a short lag from dead time, and a faster loop depends on which it is.
-So a proposal has its margins on two models, the fitted one and `pessimist`. In that one the short lag is dead
-time. Half a command period, the ticks' jitter and the phase's uncertainty are more dead time.
+moving average. A recording cannot tell a short lag from dead time, but a faster loop is less stable with dead
+time. So a proposal has its margins on two models, the fitted one and `pessimist`, whose short lag is replaced
+by dead time. Half a command period, the ticks' jitter and the phase's uncertainty are added as dead time.
 """
 
 from __future__ import annotations

@@ -265,7 +265,7 @@ def _label(
     canvas: FigureCanvasAgg,
     inch: float,
 ) -> None:
-    """Write the label of an edge where there is room for it; `taken` (boxes and labels) gains its place."""
+    """Write the label of an edge where there is room for it; its place is appended to `taken`."""
     at, way = (ends[0] + ends[1]) / 2, np.abs(ends[1] - ends[0])
     words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
     box = {"boxstyle": "square,pad=0.1", "fc": "#ffffff", "ec": "none"}

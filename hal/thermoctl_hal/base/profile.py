@@ -185,7 +185,7 @@ class Dbc(BusSpec):
     database: Database = field(compare=False)
     node_shift: int = (
         -1
-    )  # the device's address, shifted by so many bits, is part of every identifier; -1: not
+    )  # number of bits by which the device's address is shifted in each identifier; -1: it is no part of it
     faults: Mapping[str, str] = field(default_factory=dict)  # MESSAGE or MESSAGE.SIGNAL -> why it is unusable
     warning: str = ""  # file, line and message of what was read in spite of a fault
 
@@ -203,8 +203,9 @@ class Dbc(BusSpec):
     def is_j1939(self, message: str, address: int = -1) -> bool:
         """Return whether a message is received by its parameter group.
 
-        So are messages of the DBC format J1939PG, and those of source address 254, which no sender has.
-        Where the binding gives an `address`, all of 29 bits are."""
+        This applies to messages of the DBC format J1939PG, and to those of source address 254, which no
+        sender has. If the binding gives an `address`, it applies to all messages with identifiers of 29
+        bits."""
         found = self.database.get_message_by_name(message)
         if self.node_shift >= 0 or not found.is_extended_frame:
             return False

@@ -61,7 +61,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
 
 
 def valid_signals(channels: Channels, found: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:
-    """Return for each signal that comes from channels whether it is valid: every such channel is."""
+    """Return for each signal that is computed from channels whether all these channels are valid."""
     measured = set(channels.signal.values())
     return {
         name: all(

@@ -226,7 +226,9 @@ def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
     counts = np.where(measured >= FEWEST, measured, 0).sum(axis=0)
     stated = [bool(o.noise_sd or o.resolution) for o in outputs]
     over = counts.sum() >= 2 * (len(model.active) + len(drives) * len(model.uncertain))
-    if any(n >= (STATED if known and over else LEAST) for n, known in zip(counts, stated, strict=True)):
+    if any(
+        n >= (STATED if is_stated and over else LEAST) for n, is_stated in zip(counts, stated, strict=True)
+    ):
         return
     raise InputError(
         f"{paths}: too little data: at most {max(counts, default=0)} measured values of one output "
@@ -290,13 +292,13 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
     Such an initial state is wrong in the plant file. If it were kept, effects would be found that explain the
     transient from it."""
     model, nodes = compile_plant(plant), dict(plant.nodes)
-    found: dict[str, list[float]] = {}
+    contradictions: dict[str, list[float]] = {}
     for table in tables:
         for output, (error, sigmas) in start_errors(model, model.excitation(table)).items():
             if sigmas > SIGMAS:
-                found.setdefault(output, []).append(error)
+                contradictions.setdefault(output, []).append(error)
     notes = []
-    for output, errors in found.items():
+    for output, errors in contradictions.items():
         for n in sorted(ex.names(plant.outputs[output].value) & nodes.keys()):
             sigma = max(*map(abs, errors), nodes[n].initial_sigma or 0.0)
             nodes[n] = dataclasses.replace(nodes[n], initial_sigma=sigma)
@@ -305,7 +307,7 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
             notes.append(
                 f"'{output}' starts {span} from the plant's start{of}: the start of '{n}' was fitted"
             )
-    off = {output: max(errors, key=abs) for output, errors in found.items()}
+    off = {output: max(errors, key=abs) for output, errors in contradictions.items()}
     return dataclasses.replace(plant, nodes=nodes), off, notes
 
 

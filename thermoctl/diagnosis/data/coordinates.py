@@ -113,14 +113,14 @@ class Coordinates:
     """The rows of all outputs in all recordings."""
 
     def __init__(self, drives: Sequence[Excitation], most: int | None = None):
-        found = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))
-        self.channels = [c for c in found if c is not None]
+        channels = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))
+        self.channels = [c for c in channels if c is not None]
         self.recordings = len(drives)
 
     def by_output(self) -> dict[int, tuple[int, ...]]:
         """Return the positions of each measured output's channels, by output."""
-        found = sorted({c.output for c in self.channels})
-        return {j: tuple(k for k, c in enumerate(self.channels) if c.output == j) for j in found}
+        outputs = sorted({c.output for c in self.channels})
+        return {j: tuple(k for k, c in enumerate(self.channels) if c.output == j) for j in outputs}
 
     def of_recording(self, r: int) -> list[Channel]:
         """Return the channels of a recording."""

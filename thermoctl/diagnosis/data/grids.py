@@ -107,19 +107,19 @@ def grid(
     channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
-    known, node = np.unique(cells, return_inverse=True)
+    used, node = np.unique(cells, return_inverse=True)
     count = np.bincount(node, np.concatenate([c.count for c in channels]).astype(float))
-    apart = np.diff(known) * np.log2(WIDTH)
-    rough = np.zeros((len(known), len(known)))
+    apart = np.diff(used) * np.log2(WIDTH)
+    rough = np.zeros((len(used), len(used)))
     rough[0, 0] = LEVEL**-2
     for k, octaves in enumerate(apart):
         rough[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / (WALK**2 * octaves)
     walks = np.linalg.solve(
-        np.linalg.cholesky(rough).T, np.random.default_rng(3).standard_normal((len(known), DRAWS))
+        np.linalg.cholesky(rough).T, np.random.default_rng(3).standard_normal((len(used), DRAWS))
     )
     log_small = float(logsumexp(-0.5 * count @ np.exp(walks) / count.sum()) - np.log(DRAWS))
     log_rough = float(np.linalg.slogdet(rough)[1])
-    frequency = np.exp2(octave.min()) * WIDTH**known
+    frequency = np.exp2(octave.min()) * WIDTH**used
     interval = channels[0].interval
     turn = 2 * np.pi * frequency * interval / block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)

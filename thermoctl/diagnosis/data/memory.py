@@ -94,7 +94,7 @@ def stated(plant: Plant) -> dict[str, Any]:
 
 def write(folder: Path, plant: Plant, memory: Memory) -> None:
     """Write a memory into the folder of a result."""
-    found = {
+    content = {
         "format": FORMAT,
         "plant": stated(plant),
         "recordings": list(memory.recordings),
@@ -121,23 +121,23 @@ def write(folder: Path, plant: Plant, memory: Memory) -> None:
             for h in memory.hypotheses
         ],
     }
-    write_text(folder / FILE, json.dumps(found, allow_nan=False) + "\n")
+    write_text(folder / FILE, json.dumps(content, allow_nan=False) + "\n")
 
 
 def read(folder: Path, plant: Plant) -> Memory:
     """Read the memory of an earlier diagnosis of this plant. Raises InputError."""
     path = folder / FILE
     try:
-        found = json.loads(path.read_text())
-        known = found["plant"]
-        memory = Memory(tuple(_past(h) for h in found["hypotheses"]), tuple(found["recordings"]))
+        content = json.loads(path.read_text())
+        old_plant = content["plant"]
+        memory = Memory(tuple(_past(h) for h in content["hypotheses"]), tuple(content["recordings"]))
     except OSError:
         raise InputError(
             f"{path}: no such file; the folder of an earlier diagnosis (its --out) was expected (--continue)"
         ) from None
     except (ValueError, KeyError, TypeError) as e:
         raise InputError(f"{path}: no memory of a diagnosis ({e}); diagnose all recordings again") from None
-    if known != stated(plant):
+    if old_plant != stated(plant):
         raise InputError(
             f"{plant.file}: its free parameters or outputs are not those of {path}: a diagnosis goes on with the plant "
             "file that it began with; diagnose all recordings again"

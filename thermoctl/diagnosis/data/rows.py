@@ -117,16 +117,16 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     drives = [model.excitation(t) for t in rough.tables]
     noise = rough.noise(plant, drives)
     try:
-        found = fit(model, drives, noise, tolerance=1e-3, seconds=np.inf)
+        coarse_fit = fit(model, drives, noise, tolerance=1e-3, seconds=np.inf)
         chance = CHANCE / (len(tables) * len(model.outputs))
-        point = [(*at, coarse, chance) for at in zip(found.values, found.dx0, strict=True)]
+        point = [(*start, coarse, chance) for start in zip(coarse_fit.values, coarse_fit.dx0, strict=True)]
         numbers = before * len(model.states) * len(model.unknowns)
         block = min(each_of(_block, [(model, t) for t in tables], point, numbers))
     except SimulationError:
         return kept
     if block == 1:
         return kept
-    out = [means(model, t, block, *at[:2]) for t, at in zip(tables, point, strict=True)]
+    out = [means(model, t, block, *start[:2]) for t, start in zip(tables, point, strict=True)]
     return Reduced(out, block, before, sum(map(len, out)))
 
 
@@ -156,8 +156,8 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 
     sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
-    at = bisect_left(sizes, True, key=enough)  # the larger a block, the more information is lost
-    return sizes[at] if at < len(sizes) else 1
+    first = bisect_left(sizes, True, key=enough)  # the larger a block, the more information is lost
+    return sizes[first] if first < len(sizes) else 1
 
 
 def _sizes(most: int) -> list[int]:
@@ -178,8 +178,8 @@ def _information(
         count = np.isfinite(d.y[rows, j]).sum(axis=1)
         mean = columns(j)[rows].sum(axis=1) / np.sqrt(np.maximum(count, 1))[:, None]
         mean[2 * count <= block] = 0.0  # as in `means`: such a block gives no value
-        at = np.ix_([*range(k), k + j], [*range(k), k + j])
-        gram[at] += mean.T @ mean
+        entries = np.ix_([*range(k), k + j], [*range(k), k + j])
+        gram[entries] += mean.T @ mean
     seen = np.flatnonzero(np.diag(gram) > 0)
     size = np.sqrt(np.diag(gram)[seen])
     out = np.zeros(len(gram))
@@ -279,7 +279,7 @@ def means(
     whole = span <= GAP * np.median(span)
     place = middle.copy()
     place[0] = 0  # the plant starts at the first value of an output
-    at = np.searchsorted(rows, place)
+    positions = np.searchsorted(rows, place)
     for j, o in enumerate(model.plant.outputs.values()):
         if o.column in table.columns:
             error = (d.y[:, j] - run[:, j])[starts[:, None] + np.arange(block)]
@@ -289,7 +289,7 @@ def means(
             count = good.sum(axis=1)
             mean = np.where(good, error, 0.0).sum(axis=1) / np.maximum(count, 1)
             columns[o.column] = np.full(len(rows), np.nan)
-            columns[o.column][at] = np.where(whole & (2 * count > block), run[place, j] + mean, np.nan)
+            columns[o.column][positions] = np.where(whole & (2 * count > block), run[place, j] + mean, np.nan)
     return dataclasses.replace(table, t=table.t[rows], columns=columns)
 
 

@@ -58,13 +58,13 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
             f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts.values(), default=0)} measured "
             f"values of one output; {LEAST} or more are needed to learn its noise"
         )
-    found = fit(model, drives, default_noise(plant, drives), iterations=40, tolerance=1e-3, seconds=np.inf)
+    refitted = fit(model, drives, default_noise(plant, drives), iterations=40, tolerance=1e-3, seconds=np.inf)
     outputs = dict(plant.outputs)
     for j, ks in coordinates.by_output().items():
         if counts[j] < LEAST:
             continue
         channels = [coordinates.channels[k] for k in ks]
-        rows = [transform(c, found.residuals[c.recording][:, j]) for c in channels]
+        rows = [transform(c, refitted.residuals[c.recording][:, j]) for c in channels]
         powers = [_Powers(c, np.bincount(c.band, x * x)) for c, x in zip(channels, rows, strict=True)]
         o = outputs[model.outputs[j]]
         # Variance of the rounding: the plant file states it as `resolution`, so it is no part of the noise.
@@ -126,11 +126,11 @@ def command(args: argparse.Namespace) -> int:
     plant = load(args.plant)
     if Path(args.out).resolve() == Path(args.plant).resolve():
         raise InputError(f"--out {args.out}: is the plant file itself; name another file")
-    found = learnt(plant, read_recordings(plant, args.recordings))
-    save(found, args.out, note=f"{Path(args.plant).name}, with its sensors' noise learnt")
+    new_plant = learnt(plant, read_recordings(plant, args.recordings))
+    save(new_plant, args.out, note=f"{Path(args.plant).name}, with its sensors' noise learnt")
     load(args.out)
     table = Printed("output", "unit", "stated", "learnt", "known to", box=None, header_style="bold")
-    for name, o in found.outputs.items():
+    for name, o in new_plant.outputs.items():
         before = plant.outputs[name].noise
         sd = o.noise.sd if isinstance(o.noise, SensorNoise) and o.noise.sd else None
         table.add_row(

@@ -26,13 +26,13 @@ def deviations(
     """Return the standard deviations of the effects' parameters, in their units.
 
     A parameter of the plant at its bound is held there: it cannot absorb part of an effect."""
-    problem, known, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
-    moves = np.array([q not in bounds or q not in known for q, _ in problem.unknowns])
+    problem, plant_parameters, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
+    moves = np.array([q not in bounds or q not in plant_parameters for q, _ in problem.unknowns])
     sd = np.zeros(len(moves))
     inverse = np.linalg.pinv(curvature[np.ix_(moves, moves)], hermitian=True)
     sd[moves] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        if q not in known:
+        if q not in plant_parameters:
             slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
             out[q] = max(out.get(q, 0.0), float(sd[k] * slope))
     return out

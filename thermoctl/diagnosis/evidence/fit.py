@@ -98,8 +98,8 @@ def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]
         return True  # another effect replaced the equation that it changes
     effect = e.candidate.effect
     for p in effect.parameters:
-        at = f.fit.at_bound.get(e.own.get(p.name, ""))
-        if at == "high" and effect.shapes.get(p.shape or "") == "periods" or at == "low" and p.at_zero:
+        bound = f.fit.at_bound.get(e.own.get(p.name, ""))
+        if bound == "high" and effect.shapes.get(p.shape or "") == "periods" or bound == "low" and p.at_zero:
             return True
     if e.candidate.effect.prior is not None:
         return False
@@ -127,15 +127,15 @@ def fitted(
     The refit ends early if it stays far from `best`, the best hypothesis so far. `parent`: the hypothesis
     before the last effect was added."""
     case.budget.spend()
-    found = _refitted(case, plant, effects, start, best, parent)
+    result = _refitted(case, plant, effects, start, best, parent)
     for _ in range(MOVES):
-        behind = best is not None and found.log_likelihood < best.log_likelihood - HOPELESS
-        later = None if behind else moved(case, found.rough_plant, effects, found.rough)
+        behind = best is not None and result.log_likelihood < best.log_likelihood - HOPELESS
+        later = None if behind else moved(case, result.rough_plant, effects, result.rough)
         again = later and _refitted(case, later, effects, None, best, parent)
-        if not again or again.log_evidence <= found.log_evidence:
+        if not again or again.log_evidence <= result.log_evidence:
             break
-        found = again
-    return found
+        result = again
+    return result
 
 
 def _refitted(
@@ -235,12 +235,12 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
     problem = posterior.problem
     values, _ = problem.unpack(z)
     low, high = (bound - z for bound in posterior.bounds)
-    at, slope = z.copy(), np.ones(len(z))
+    current, slope = z.copy(), np.ones(len(z))
     for k, (q, r) in enumerate(problem.unknowns[: problem.n_parameters]):
         scale = problem.scales[q]
-        at[k] = float(values[r or 0, posterior.model.parameters.index(q)])
-        slope[k] = scale.slope(at[k])
-        low[k], high[k] = (scale.low - at[k]) / slope[k], (scale.high - at[k]) / slope[k]
+        current[k] = float(values[r or 0, posterior.model.parameters.index(q)])
+        slope[k] = scale.slope(current[k])
+        low[k], high[k] = (scale.low - current[k]) / slope[k], (scale.high - current[k]) / slope[k]
     zero = np.zeros(len(free))
     part, bounds = now.matrix[np.ix_(free, free)], (low[free], high[free])
     step, _ = bounded_step(zero, now.gradient[free], part, 0.0, bounds)
@@ -248,7 +248,7 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
     for k, change in zip(free, step, strict=True):
         if k < problem.n_parameters:
             scale = problem.scales[problem.unknowns[k][0]]
-            out[k] = scale.z(float(np.clip(at[k] + slope[k] * change, scale.low, scale.high)))
+            out[k] = scale.z(float(np.clip(current[k] + slope[k] * change, scale.low, scale.high)))
         else:
             out[k] = z[k] + change
     return out
@@ -266,7 +266,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
     bounds = at_bound(problem, z)
     sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
-    found = Fit(
+    maximum = Fit(
         posterior.model,
         values,
         dx0,
@@ -289,11 +289,11 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
     )
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
-        found, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (found, rough))
+        maximum, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (maximum, rough))
     return Fitted(
         Hypothesis(tuple(posterior.effects)),
-        updated(posterior.plant, found, posterior.drives),
-        found,
+        updated(posterior.plant, maximum, posterior.drives),
+        maximum,
         average.log_likelihood,
         log_density(posterior, z, sd),
         volume,
@@ -312,7 +312,9 @@ def remembered(case: Case, f: Fitted) -> Past:
     """Return the posterior of a hypothesis from all recordings so far."""
     shared = np.array([r is None for _, r in f.fit.unknowns], bool)
     names = tuple(q for q, r in f.fit.unknowns if r is None)
-    at = [(case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids]
+    outputs = [
+        (case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids
+    ]
     return Past(
         placed_before(f.hypothesis.effects, f.plant),
         names,
@@ -320,8 +322,11 @@ def remembered(case: Case, f: Fitted) -> Past:
         f.fit.z[shared],
         f.curvature,
         f.log_evidence,
-        {o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels) for o, g in at},
-        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in at},
+        {
+            o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels)
+            for o, g in outputs
+        },
+        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in outputs},
     )
 
 
@@ -353,12 +358,12 @@ def with_residuals(case: Case, f: Fitted) -> Fitted:
     """Return the fitted hypothesis with its residuals, simulated again if they were too many to keep."""
     if f.fit.residuals:
         return f
-    drives, found = case.drives(f.fit.model), f.fit
+    drives, fit = case.drives(f.fit.model), f.fit
     errors = [
-        d.y - found.model.run(d, values, dx0).y
-        for d, values, dx0 in zip(drives, found.values, found.dx0, strict=True)
+        d.y - fit.model.run(d, values, dx0).y
+        for d, values, dx0 in zip(drives, fit.values, fit.dx0, strict=True)
     ]
-    return dataclasses.replace(f, fit=dataclasses.replace(found, residuals=errors))
+    return dataclasses.replace(f, fit=dataclasses.replace(fit, residuals=errors))
 
 
 def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) -> float:
@@ -380,12 +385,12 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
     return out - periods * float(np.log(PERIODS))
 
 
-def evidence_at(posterior: Posterior, z: np.ndarray, found: Fitted) -> float:
+def evidence_at(posterior: Posterior, z: np.ndarray, hypothesis: Fitted) -> float:
     """Return log p(D | z) + log p(z), the integrand of `log_evidence`.
 
-    The standard deviations of the effects' sizes are those of `found`."""
+    The standard deviations of the effects' sizes are those of `hypothesis`."""
     return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
-        posterior, z, found.sd
+        posterior, z, hypothesis.sd
     )
 
 

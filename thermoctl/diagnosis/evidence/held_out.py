@@ -136,14 +136,14 @@ def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
         model = compile_plant(f.plant)
         drives = [model.excitation(t) for t in train]
         try:
-            found = refit.fit(
+            refitted = refit.fit(
                 model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
             )
             for r, t in enumerate(case.tables):
                 aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
                 # The initial state is that of the whole recording.
                 d = dataclasses.replace(drives[r], y=aside)
-                error = d.y - model.run(model.prepare(d), found.values[r], found.dx0[r]).y
+                error = d.y - model.run(model.prepare(d), refitted.values[r], refitted.dx0[r]).y
                 errors[r] = np.where(np.isfinite(aside), error, errors[r])
         except SimulationError:
             continue

@@ -24,8 +24,8 @@ def floor(g: Grid, powers: Sequence[np.ndarray], absorbed: int) -> float:
     power = g.power(powers) / g.shape
     octave = np.cumsum(np.append(0.0, np.diff(np.log2(g.turn)))).astype(int)
     rows = np.bincount(octave, g.count) - absorbed
-    told = rows > 0
-    allowed = np.bincount(octave, power)[told] / chdtri(rows[told], 1 - RARE)
+    filled = rows > 0
+    allowed = np.bincount(octave, power)[filled] / chdtri(rows[filled], 1 - RARE)
     return float(min(allowed.min(initial=g.most), g.most))
 
 
@@ -65,8 +65,8 @@ def rounded(case: Case) -> list[bool]:
 
 def remainder(case: Case, f: Fitted) -> float:
     """Return the largest probability of a remainder at an output that is not coarsely rounded."""
-    known = zip(f.average.remainder, rounded(case), strict=True)
-    return max((p for p, coarse in known if not coarse), default=0.0)
+    probabilities = zip(f.average.remainder, rounded(case), strict=True)
+    return max((p for p, coarse in probabilities if not coarse), default=0.0)
 
 
 def levels(case: Case, f: Fitted) -> list[float]:

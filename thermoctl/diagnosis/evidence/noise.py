@@ -77,13 +77,13 @@ class _Output:
 
 def averaged(grids: Sequence[Grid], powers: Sequence[np.ndarray], unsure: bool = False) -> Averaged:
     """Average the likelihood of banded `powers` (one a channel) over noise and remainder."""
-    found = [_output(g, g.power(powers), None, unsure) for g in grids]
+    outputs = [_output(g, g.power(powers), None, unsure) for g in grids]
     return Averaged(
-        sum(f.log_likelihood for f in found),
-        _by_channel(grids, [f.inverse for f in found], powers),
-        [f.sensor for f in found],
-        [f.remainder for f in found],
-        [f.unsure for f in found],
+        sum(f.log_likelihood for f in outputs),
+        _by_channel(grids, [f.inverse for f in outputs], powers),
+        [f.sensor for f in outputs],
+        [f.remainder for f in outputs],
+        [f.unsure for f in outputs],
     )
 
 
@@ -115,8 +115,8 @@ class Around:
 
     def weighed(self, others: Sequence[np.ndarray]) -> tuple[float, list[np.ndarray]]:
         """Return the rise, and E[1/V] in the bands of each channel."""
-        found = list(self._each(others))
-        return sum(rise for rise, _ in found), _by_channel(self.grids, [v for _, v in found], others)
+        changes = list(self._each(others))
+        return sum(rise for rise, _ in changes), _by_channel(self.grids, [v for _, v in changes], others)
 
     def _each(self, others: Sequence[np.ndarray]) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rise of each output, and E[1/V] at its frequencies."""
@@ -141,24 +141,24 @@ def _output(
     kinds = (NOISE, REMAINDER) if g.sensor else (NOISE, SLOW, REMAINDER)
     densities = [density(g, kind) for kind in kinds]
     starts: list[np.ndarray | None] = [*near] if near else [None] * len(kinds)
-    found = [d.top(power, x) for d, x in zip(densities, starts, strict=True)]
+    maxima = [d.top(power, x) for d, x in zip(densities, starts, strict=True)]
     odds = ABSENT * np.array([1.0] if g.sensor else [WHITE, 1 - WHITE])
     scores = np.log(np.append(odds, 1 - ABSENT)) + [
-        log_p(g, kind, *f) for kind, f in zip(kinds, found, strict=True)
+        log_p(g, kind, *f) for kind, f in zip(kinds, maxima, strict=True)
     ]
     whole = float(scores.max() + np.log(np.exp(scores - scores.max()).sum()))
     weight = np.exp(scores - whole)
-    each = np.array([1 / at.variance for at, _ in found])
+    each = np.array([1 / spot.variance for spot, _ in maxima])
     mean = weight @ each
     spread = np.zeros((0, 0))
     if unsure:
         apart = each - mean
-        within = sum(w * _unsure(*f) for w, f in zip(weight, found, strict=True))
+        within = sum(w * _unsure(*f) for w, f in zip(weight, maxima, strict=True))
         spread = within + (apart.T * weight) @ apart
     sensor = g.variance * float(
-        weight @ [np.exp(at.x[0]) + g.clock * np.exp(at.x[len(g.scales) - 1]) for at, _ in found]
+        weight @ [np.exp(spot.x[0]) + g.clock * np.exp(spot.x[len(g.scales) - 1]) for spot, _ in maxima]
     )
-    return _Output(whole, mean, sensor, float(weight[-1]), spread, tuple(at.x for at, _ in found))
+    return _Output(whole, mean, sensor, float(weight[-1]), spread, tuple(spot.x for spot, _ in maxima))
 
 
 def density(g: Grid, kind: int) -> Density:
@@ -184,15 +184,15 @@ def density(g: Grid, kind: int) -> Density:
     return made[kind]
 
 
-def log_p(g: Grid, kind: int, at: Spot, root: np.ndarray) -> float:
+def log_p(g: Grid, kind: int, spot: Spot, root: np.ndarray) -> float:
     """Return log p(R) of a density by Laplace's method, from its maximum and its curvature's root there."""
-    score = at.log_density - 0.5 * float(g.count.sum()) * LOG_2PI - float(np.log(g.scales).sum())
+    score = spot.log_density - 0.5 * float(g.count.sum()) * LOG_2PI - float(np.log(g.scales).sum())
     if kind == REMAINDER:
         score += 0.5 * g.log_rough - g.log_small
     return score - float(np.log(root.diagonal()).sum())
 
 
-def _unsure(at: Spot, root: np.ndarray) -> np.ndarray:
+def _unsure(spot: Spot, root: np.ndarray) -> np.ndarray:
     """Return the covariance (nodes, nodes) of 1/V under one density, to first order."""
-    moves = solve_triangular(root, (at.slope / at.variance[:, None]).T, lower=True)
+    moves = solve_triangular(root, (spot.slope / spot.variance[:, None]).T, lower=True)
     return np.asarray(moves.T @ moves)

@@ -20,16 +20,16 @@ FINER = 4  # each grid is finer than the one before by this factor
 GAIN = 2.0  # least decrease of the squared errors over the noise to move a time: one nat
 
 
-def moved(case: Case, plant: Plant, effects: Sequence[Placed], found: Fit) -> Plant | None:
+def moved(case: Case, plant: Plant, effects: Sequence[Placed], fit: Fit) -> Plant | None:
     """Return the plant with better times of its jumps and no other change; None if no other times fit better.
 
     Each time is searched on finer and finer grids about it, from the screening's step to half a sample."""
     own = {e.own.get(p.name) for e in effects for p in e.candidate.effect.parameters if p.shape in TIMES}
-    times = {q: k for k, (q, r) in enumerate(found.unknowns) if q in own and r is None}
+    times = {q: k for k, (q, r) in enumerate(fit.unknowns) if q in own and r is None}
     if not times:
         return None
-    drives = case.drives(found.model)
-    problem = Problem(found.model, drives, case.noise, found.priors)
+    drives = case.drives(fit.model)
+    problem = Problem(fit.model, drives, case.noise, fit.priors)
     duration = max(float(d.t[-1]) for d in drives)
     sample = min(float(np.median(np.diff(d.t))) for d in drives)
 
@@ -40,16 +40,16 @@ def moved(case: Case, plant: Plant, effects: Sequence[Placed], found: Fit) -> Pl
         except SimulationError:
             return float("inf")
 
-    z = found.z.copy()
+    z = fit.z.copy()
     first = least = cost(z)
     for q, k in times.items():
         step = duration / ONSETS
         while step > 0.5 * sample:
             middle = problem.scales[q].value(z[k])
-            for at in middle + step * np.arange(1 - FINER, FINER) / FINER:
+            for time in middle + step * np.arange(1 - FINER, FINER) / FINER:
                 trial = z.copy()
-                trial[k] = problem.scales[q].z(float(np.clip(at, 0.0, duration)))
-                if at != middle and (now := cost(trial)) < least:
+                trial[k] = problem.scales[q].z(float(np.clip(time, 0.0, duration)))
+                if time != middle and (now := cost(trial)) < least:
                     z, least = trial, now
             step /= FINER
     if not least < first - GAIN:

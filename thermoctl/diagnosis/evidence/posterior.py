@@ -213,11 +213,11 @@ class Posterior:
         """Return each recording's share of gradient and curvature.
 
         `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel."""
-        data, at = [], 0
+        data, begin = [], 0
         for channels in self.channels:
-            end = at + len(channels)
-            data.append((rows[at:end], inverse[at:end]))
-            at = end
+            end = begin + len(channels)
+            data.append((rows[begin:end], inverse[begin:end]))
+            begin = end
         if not self.problem.keeps:
             point = self.problem.unpack(z)
             return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r]), 2)
@@ -250,11 +250,13 @@ class Posterior:
         powers = self.case.coordinates.powers(rows)
         for g, unsure in zip(self.case.grids, averaged(self.case.grids, powers, True).unsure, strict=True):
             pull = np.zeros((len(unsure), len(z)))
-            at = 0
+            begin = 0
             for k in g.channels:
                 unknowns, x = by_band[k]
-                np.add.at(pull, np.ix_(g.node[at : at + len(x)], unknowns), x)  # two bands may share a node
-                at += len(x)
+                np.add.at(
+                    pull, np.ix_(g.node[begin : begin + len(x)], unknowns), x
+                )  # two bands may share a node
+                begin += len(x)
             out += pull.T @ unsure @ pull
         return out
 
@@ -287,12 +289,14 @@ class Posterior:
         if self.kept is None:
             return out
         moved = self.rows(self.errors(spot.z + PROBE * step))
-        channels, seen, at = self.case.coordinates.channels, spot.found, 0
+        channels, seen, position = self.case.coordinates.channels, spot.found, 0
         for unknowns, slopes in self.kept[1]:
             for jac in slopes:
-                second = (moved[at] - seen.rows[at]) / PROBE + jac @ step[unknowns]
-                np.add.at(out, unknowns, jac.T @ (seen.average.inverse[at][channels[at].band] * second))
-                at += 1
+                second = (moved[position] - seen.rows[position]) / PROBE + jac @ step[unknowns]
+                np.add.at(
+                    out, unknowns, jac.T @ (seen.average.inverse[position][channels[position].band] * second)
+                )
+                position += 1
         return out * (2 / PROBE)
 
     def climb(self, z: np.ndarray, goal: float) -> Climbed[Seen]:
@@ -318,9 +322,9 @@ def _priors(
         precision[k] = BELIEF**-2
         if q in own:
             c, p = own[q]
-            told = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
-            mean[k], precision[k] = 0.5, 1e-6 if told else 1e-4
-            if (p.amplitude or c.effect.shapes.get(p.shape or "") == "delays") and not told:
+            stated = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
+            mean[k], precision[k] = 0.5, 1e-6 if stated else 1e-4
+            if (p.amplitude or c.effect.shapes.get(p.shape or "") == "delays") and not stated:
                 sizes[k] = own[q]
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
@@ -328,7 +332,7 @@ def _priors(
 
 
 def gaussian(posterior: Posterior) -> np.ndarray:
-    """Return the unknowns with a Gaussian prior: the plant's, and those that earlier recordings have."""
+    """Return the unknowns with a Gaussian prior: the plant's, and those from earlier recordings."""
     names = {n for e in posterior.effects for n in e.own.values()}
     return np.array(
         [k for k, (q, _) in enumerate(posterior.problem.unknowns) if q not in names or k in posterior.shared],

@@ -55,8 +55,8 @@ def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
     scores = {}
     for i, node in enumerate(reach.nodes):
         by_cell = np.zeros(len(reach.share))
-        found = reach.cells(case.coordinates, [g.channels for g in case.grids], i)
-        for g, own, cells in zip(case.grids, f.average.sensor, found, strict=True):
+        variances = reach.cells(case.coordinates, [g.channels for g in case.grids], i)
+        for g, own, cells in zip(case.grids, f.average.sensor, variances, strict=True):
             count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
             power = np.concatenate([f.powers[k] for k in g.channels])
             by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
@@ -69,7 +69,7 @@ def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
 
     The strongest is first; there are at most SHOWN."""
     model, j = f.fit.model, f.fit.model.outputs.index(output)
-    found: dict[str, list[tuple[float, float, float]]] = {}
+    products: dict[str, list[tuple[float, float, float]]] = {}
     for r, d in enumerate(case.drives(model)):
         values = signals(model, d, f.fit.values[r], model.run(d, f.fit.values[r], f.fit.dx0[r]).x)
         e = f.fit.residuals[r][:, j]
@@ -78,9 +78,9 @@ def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
             for label, signal in ((name, x), (f"change of {name}", np.gradient(x, d.t))):
                 good = np.isfinite(e) & np.isfinite(signal)
                 a, b = e[good] - e[good].mean(), signal[good] - signal[good].mean()
-                found.setdefault(label, []).append((float(a @ b), float(a @ a), float(b @ b)))
+                products.setdefault(label, []).append((float(a @ b), float(a @ a), float(b @ b)))
     size = {}
-    for label, parts in found.items():
+    for label, parts in products.items():
         cross, first, second = np.sum(parts, axis=0)
         size[label] = abs(cross) / np.sqrt(first * second) if first * second > 0 else 0.0
     return tuple(sorted((k for k, v in size.items() if v >= CORRELATED), key=lambda k: -size[k])[:SHOWN])

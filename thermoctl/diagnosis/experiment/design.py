@@ -77,7 +77,7 @@ def levers(
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
-    found: list[Lever] = []
+    out: list[Lever] = []
     series: list[np.ndarray] = []
     for i in plant.inputs.values():
         if i.name not in only if only else i.unit and _of_surroundings(i.unit):
@@ -86,17 +86,17 @@ def levers(
         values = np.concatenate(parts) if parts else np.zeros(0)
         if not _moved(values, parts):
             continue
-        alike = next((k for k, other in enumerate(series) if _together(values, other)), None)
-        if alike is None:
-            found.append(_lever(i.name, i.column, tables, limits))
+        partner = next((k for k, other in enumerate(series) if _together(values, other)), None)
+        if partner is None:
+            out.append(_lever(i.name, i.column, tables, limits))
             series.append(values)
         else:
-            other, lever = series[alike], found[alike]
+            other, lever = series[partner], out[partner]
             both = np.isfinite(values) & np.isfinite(other)
             factor, offset = np.polyfit(other[both], values[both], 1)
             moves = {**lever.moves, i.name: (float(factor), float(offset))}
-            found[alike] = dataclasses.replace(lever, moves=moves)
-    return found
+            out[partner] = dataclasses.replace(lever, moves=moves)
+    return out
 
 
 def _of_surroundings(unit: str) -> bool:
@@ -178,24 +178,24 @@ def courses(lever: Lever, duration_s: float, step_s: float, seed: int = 0) -> di
     }
     out = {k: _ramps(lever, p, step_s) for k, p in plans.items()}
     for word, part in (("large", 1.0), ("small", 0.2)):
-        at = np.linspace(0, whole, 9)
+        times = np.linspace(0, whole, 9)
         swing = 0.5 * min(part * span, lever.rate * whole / 8)
         wave = np.where(np.arange(9) % 2, swing, -swing) + middle
-        out[f"in {word} triangles"] = np.column_stack([at, wave])
+        out[f"in {word} triangles"] = np.column_stack([times, wave])
     return out
 
 
-def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s: float) -> list[Excitation]:
+def family(plant: Plant, tables: Sequence[Table], driven: Sequence[Lever], step_s: float) -> list[Excitation]:
     """Return the candidates: each lever alone, the others at rest, and all together; at each of LENGTHS."""
     usual = float(np.median([t.t[-1] - t.t[0] for t in tables]))
-    constant, starts = _constant(plant, tables, {n for lever in found for n in lever.moves})
+    constant, starts = _constant(plant, tables, {n for lever in driven for n in lever.moves})
     out = []
     for share in LENGTHS:
         duration_s = usual * share
-        for title, plan in _plans(found, duration_s, step_s):
+        for title, plan in _plans(driven, duration_s, step_s):
             corners = {
                 n: np.column_stack([plan[lever.name][:, 0], plan[lever.name][:, 1] * factor + offset])
-                for lever in found
+                for lever in driven
                 for n, (factor, offset) in lever.moves.items()
             }
             for start in starts if share == LENGTHS[0] else starts[:1]:
@@ -207,18 +207,18 @@ def family(plant: Plant, tables: Sequence[Table], found: Sequence[Lever], step_s
 
 
 def _plans(
-    found: Sequence[Lever], duration_s: float, step_s: float
+    driven: Sequence[Lever], duration_s: float, step_s: float
 ) -> list[tuple[str, dict[str, np.ndarray]]]:
     """Return (title, {lever: corners}) of every candidate of one duration."""
-    rest = {lever.name: np.array([[0.0, lever.rest], [duration_s, lever.rest]]) for lever in found}
+    rest = {lever.name: np.array([[0.0, lever.rest], [duration_s, lever.rest]]) for lever in driven}
     plans = [
         (f"{lever.name} {words}", rest | {lever.name: c})
-        for lever in found
+        for lever in driven
         for words, c in courses(lever, duration_s, step_s).items()
     ]
-    if len(found) > 1:
-        each = {v.name: courses(v, duration_s, step_s, seed) for seed, v in enumerate(found)}
-        together = [w for w in each[found[0].name] if w.startswith(("in a pseudo", "held at its end"))]
+    if len(driven) > 1:
+        each = {v.name: courses(v, duration_s, step_s, seed) for seed, v in enumerate(driven)}
+        together = [w for w in each[driven[0].name] if w.startswith(("in a pseudo", "held at its end"))]
         plans += [(f"{' and '.join(each)} {w}", {n: c[w] for n, c in each.items()}) for w in together]
     return plans
 

@@ -84,12 +84,12 @@ def peaks(entry: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, p in entry["predicted"].items():
         unit = f" {p['unit']}" if p["unit"] else ""
-        known = (
+        recorded = (
             f"recorded {p['recorded'][0]:.4g} to {p['recorded'][1]:.4g}"
             if p["recorded"]
             else "never recorded"
         )
         limit = entry["limits"].get(name)
         kept = f", --limit {limit[0]:g} to {limit[1]:g}" if limit else ""
-        lines.append(f"{name}: {p['low']:.4g} to {p['high']:.4g}{unit} predicted ({known}{kept})")
+        lines.append(f"{name}: {p['low']:.4g} to {p['high']:.4g}{unit} predicted ({recorded}{kept})")
     return lines

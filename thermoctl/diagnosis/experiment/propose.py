@@ -99,9 +99,9 @@ def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
             scaled[c, c] = IN_RANGE
         elif c >= len(model.active):
             slopes[c] = model.plant.nodes[model.uncertain[c - len(model.active)]].initial_sigma or 0.0
-    known = [c for c, q in enumerate(model.unknowns) if q in place and slopes[c]]
-    index = [place[model.unknowns[c]] for c in known]
-    scaled[np.ix_(known, known)] = covariance[np.ix_(index, index)]
+    determined = [c for c, q in enumerate(model.unknowns) if q in place and slopes[c]]
+    index = [place[model.unknowns[c]] for c in determined]
+    scaled[np.ix_(determined, determined)] = covariance[np.ix_(index, index)]
     scaled[np.diag_indices(nq)] = np.minimum(
         np.diag(scaled), 1.0
     )  # no parameter is more uncertain than its range
@@ -113,11 +113,9 @@ def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
 def distances(
     predictions: Sequence[Prediction], columns: Sequence[Sequence[int]], sigma: np.ndarray
 ) -> np.ndarray:
-    """Compute D of (1) of every two predictions over their columns, by Woodbury's identity.
+    """Compute D of (1) for each pair of predictions over their columns, by Woodbury's identity.
 
-    `sigma`: noise of each column.
-
-    Each pair's matrix consists of products that several pairs share."""
+    `sigma`: noise of each column. The products of one prediction are computed once for all its pairs."""
     y, load = (
         [
             np.concatenate([p[part][:, j] / s for j, s in zip(own, sigma, strict=True)])
@@ -163,25 +161,28 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
     return np.array(out)
 
 
-def survivors(found: Diagnosis) -> list[Standing]:
+def survivors(diagnosis: Diagnosis) -> list[Standing]:
     """Return the hypotheses, or laws, that are not ruled out, the likeliest first; none if all is decided.
 
     Each has its probability and its name. Unless the verdict is ambiguous, the plant without effects is one
     of them. If other data confirmed no effect, its probability is at least that of this doubt."""
-    verdict = found.decision.verdict
+    verdict = diagnosis.decision.verdict
     if verdict in ("ambiguous", "unexplained") or (
-        verdict == "consistent" and found.posterior.something > 0.5
+        verdict == "consistent" and diagnosis.posterior.something > 0.5
     ):
-        hypotheses = {k: p for k, p in found.posterior.hypotheses.items() if k or verdict != "ambiguous"}
+        hypotheses = {k: p for k, p in diagnosis.posterior.hypotheses.items() if k or verdict != "ambiguous"}
         if verdict == "unexplained":
-            doubt = 1.0 - min(found.asked.values(), default=1.0)
+            doubt = 1.0 - min(diagnosis.asked.values(), default=1.0)
             hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
-        fits = {w.fitted.hypothesis.keys: w.fitted for w in found.searched.tried}
+        fits = {w.fitted.hypothesis.keys: w.fitted for w in diagnosis.searched.tried}
         likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
-    elif found.law:
+    elif diagnosis.law:
         likely = [
             (f, share, described(p, f))
-            for p, f, share in ((found.law.proposal, found.law.fitted, found.law.share), *found.law.rivals)
+            for p, f, share in (
+                (diagnosis.law.proposal, diagnosis.law.fitted, diagnosis.law.share),
+                *diagnosis.law.rivals,
+            )
         ]
     else:
         return []
@@ -267,7 +268,7 @@ class _Comparison:
 
 
 def propose(
-    found: Diagnosis,
+    diagnosis: Diagnosis,
     drivable: Sequence[str] = (),
     limits: Ranges = NONE,
     progress: Callable[[str], None] | None = None,
@@ -276,14 +277,14 @@ def propose(
 
     None if all is decided (`survivors`) or no input can be driven.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
-    case = found.case
+    case = diagnosis.case
     for n in limits:
         if n not in case.plant.inputs and n not in case.plant.outputs:
             raise InputError(
                 f"a limit of '{n}': no such input or output of {case.plant.file}; there are "
                 + ", ".join((*case.plant.inputs, *case.plant.outputs))
             )
-    standing = survivors(found)
+    standing = survivors(diagnosis)
     if len(standing) < 2:
         return None
     drive = levers(case.plant, case.tables, drivable, limits)
@@ -377,14 +378,14 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
     shown = [plant.outputs[comparison.outputs[j]] for j in seen]
     most, where = bits(best.distances, comparison.weights) + WORTH_A_SENSOR, ""
     for node in plant.nodes.values():
-        alike = [sigma[j] for j, o in zip(seen, shown, strict=True) if o.unit == node.unit]
+        same_unit = [sigma[j] for j, o in zip(seen, shown, strict=True) if o.unit == node.unit]
         if (
             any(o.value.op == "name" and o.value.value == node.name for o in shown)
-            or not alike
+            or not same_unit
             or any(node.name not in b.model.states for b in comparison.predictors)
         ):
             continue
-        noise = np.append(sigma[seen], np.median(alike)) * share
+        noise = np.append(sigma[seen], np.median(same_unit)) * share
         with_sensor = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
         if with_sensor > most:
             most, where = with_sensor + WORTH_A_SENSOR, node.name

@@ -136,9 +136,9 @@ class Builder:
             rate = next(
                 (f.unit for f in self.base.flows.values() if node in (f.source, f.target) and f.unit), None
             )
-        known = {of: self._signal_unit(self.symbols.get(of[-1])) for of in UNITS_OF}
-        known |= {"unit_of_y": self._unit_of_y(), "unit_of_rate": rate}
-        for key, unit in known.items():
+        units = {of: self._signal_unit(self.symbols.get(of[-1])) for of in UNITS_OF}
+        units |= {"unit_of_y": self._unit_of_y(), "unit_of_rate": rate}
+        for key, unit in units.items():
             if key in text:
                 if unit is None:
                     return None
@@ -270,13 +270,13 @@ class Builder:
 
     def _spread_at_start(self, source: Expr) -> float | None:
         """Return the standard deviation of `source` at the start, from its nodes' standard deviations."""
-        known = {q: p.value for q, p in self.base.parameters.items()}
+        values = {q: p.value for q, p in self.base.parameters.items()}
         source = ex.substitute(source, lambda e: e.args[0] if e.op == "delay" else None)
         total = 0.0
         for n in ex.names(source) & set(self.base.nodes):
             slope = ex.derivative(source, n)
-            if ex.names(slope) <= set(known):
-                total += (float(ex.evaluate(slope, known)) * (self.base.nodes[n].initial_sigma or 0.0)) ** 2
+            if ex.names(slope) <= set(values):
+                total += (float(ex.evaluate(slope, values)) * (self.base.nodes[n].initial_sigma or 0.0)) ** 2
         return float(np.sqrt(total)) or None
 
     def _straight(self, symbol: str) -> None:
@@ -327,9 +327,9 @@ class Builder:
 
     def _exponent(self, parameter: str) -> None:
         f = self.base.flows[self.c.place.flow or ""]
-        found = outlet(self.rig, f)
-        assert found is not None  # the place is an outlet
-        part, head, _ = found
+        parts = outlet(self.rig, f)
+        assert parts is not None  # the place is an outlet
+        part, head, _ = parts
         new = ex.make("**", head, name(self.c.own(parameter)))
         rate = ex.substitute(f.rate, lambda e: new if e is part else None)
         self.flows[f.name] = dataclasses.replace(f, rate=rate, unit=None)

@@ -44,7 +44,7 @@ class Candidate(Placement):
         share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
         out = []
         for d in self.rig.drives:
-            known = {
+            symbols = {
                 "duration": num(float(d.t[-1] - d.t[0])),
                 "first_air": num(self.rig.first_air(d)),
                 **{
@@ -54,11 +54,11 @@ class Candidate(Placement):
                 },
             }
 
-            def told(e: Expr, known: Mapping[str, Expr] = known) -> Expr | None:
+            def replaced(e: Expr, symbols: Mapping[str, Expr] = symbols) -> Expr | None:
                 """Return the plant's expression for a name of the catalogue's prior."""
-                return known.get(str(e.value)) if e.op == "name" else None
+                return symbols.get(str(e.value)) if e.op == "name" else None
 
-            out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, told))))
+            out.append(Prior(d.name, ex.mul(num(share), ex.substitute(self.effect.prior, replaced))))
         return out
 
     def extend(

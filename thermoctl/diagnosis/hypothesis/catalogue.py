@@ -14,15 +14,15 @@ CATALOGUE = shipped("config/effects")
 
 def catalogue(folders: Sequence[Path] = (CATALOGUE,)) -> dict[str, Effect]:
     """Return all entries of these folders by name. A later entry of the same name wins. Raises InputError."""
-    found = {}
+    entries = {}
     for folder in folders:
         files = sorted(Path(folder).glob("*.yaml"))
         if not files:
             raise yamlfile.InputError(f"{folder}: no effect files (*.yaml) here")
         for file in files:
             effect = read(yamlfile.load(file))
-            found[effect.name] = effect
-    return found
+            entries[effect.name] = effect
+    return entries
 
 
 def contained(entries: Mapping[str, Effect]) -> dict[str, str]:

@@ -141,8 +141,8 @@ class Effect:
             """Return the parameter with the outlet's exponent as its null value."""
             if p.origin != "exponent" or p.trial is None:
                 return p
-            known = {"exponent": ex.num(exponent)}
-            trial = ex.substitute(p.trial, lambda e: known.get(str(e.value)) if e.op == "name" else None)
+            values = {"exponent": ex.num(exponent)}
+            trial = ex.substitute(p.trial, lambda e: values.get(str(e.value)) if e.op == "name" else None)
             return dataclasses.replace(p, null=exponent, trial=trial)
 
         return dataclasses.replace(self, parameters=tuple(map(with_null, self.parameters)))
@@ -177,9 +177,9 @@ def read(root: Node) -> Effect:
     amplitudes = max((_amplitudes(p.trial) for p in parameters), default=0)
     dims = _dims(top, amplitudes)
     reads = tuple(str(node.value) for node in top.list("reads", required=False))
-    known = {*SYMBOLS[where], *(str(n.value) for n in needs), *reads, *EVERYWHERE, *sections}
+    symbols = {*SYMBOLS[where], *(str(n.value) for n in needs), *reads, *EVERYWHERE, *sections}
     prior = top.given("prior")
-    changes = _lists_of_changes(top, known, set(sections), where)
+    changes = _lists_of_changes(top, symbols, set(sections), where)
     effect = Effect(
         name,
         title,
@@ -272,14 +272,14 @@ def _amplitudes(trial: Expr | None) -> int:
     return max((int(n[1:] or 1) for n in names if re.fullmatch(r"s\d*", n)), default=0)
 
 
-def _expression(node: Node, known: Iterable[str], what: str) -> Expr:
+def _expression(node: Node, symbols: Iterable[str], what: str) -> Expr:
     if isinstance(node.value, dict | list):
         raise node.error(f"{what}: an expression was expected, found {yamlfile.kind_of(node)}")
     try:
         read = ex.parse(str(node.value))
     except ex.ExpressionError as e:
         raise node.error(f"{what}: {e}") from None
-    allowed = sorted(set(known))
+    allowed = sorted(set(symbols))
     for n in sorted(ex.names(read) - set(allowed)):
         raise node.error(
             f"{what}: '{n}' is not known here{suggest(n, allowed)}; allowed are {', '.join(allowed)}"
@@ -288,7 +288,7 @@ def _expression(node: Node, known: Iterable[str], what: str) -> Expr:
 
 
 def _lists_of_changes(
-    top: Section, known: set[str], parameters: set[str], where: str
+    top: Section, symbols: set[str], parameters: set[str], where: str
 ) -> tuple[tuple[Mapping[str, Any], ...], ...]:
     """Return the change and its variants."""
     variants = top.list("variants", required=False)
@@ -298,23 +298,23 @@ def _lists_of_changes(
     for changes in (top.list("change"), *(v.value for v in variants)):
         if not changes:
             raise top.get("change").error("change: at least one change was expected, such as {flow: {...}}")
-        _changes(changes, known, parameters, where)
+        _changes(changes, symbols, parameters, where)
     return tuple(tuple(node.plain()) for node in (top.get("change"), *variants))
 
 
-def _changes(changes: Sequence[Node], known: set[str], parameters: set[str], where: str) -> None:
+def _changes(changes: Sequence[Node], symbols: set[str], parameters: set[str], where: str) -> None:
     made: set[str] = set()
     for item in changes:
         if not isinstance(item.value, dict) or len(item.value) != 1:
             raise item.error("change: one mapping for each change was expected, such as {flow: {...}}")
         ((kind, node),) = item.value.items()
         if kind in FORMS:
-            _expression(node, {*known, *made, *({OWN[kind]} if kind in OWN else ())}, kind)
+            _expression(node, {*symbols, *made, *({OWN[kind]} if kind in OWN else ())}, kind)
         elif kind in PARTS:
-            _part(kind, node, {*known, *made}, made, parameters, where)
+            _part(kind, node, {*symbols, *made}, made, parameters, where)
         elif kind == "straight":
-            if node.value not in known:
-                raise node.error(f"straight: a symbol was expected, one of {', '.join(sorted(known))}")
+            if node.value not in symbols:
+                raise node.error(f"straight: a symbol was expected, one of {', '.join(sorted(symbols))}")
         elif kind == "exponent":
             if node.value not in parameters:
                 raise node.error(
@@ -327,7 +327,7 @@ def _changes(changes: Sequence[Node], known: set[str], parameters: set[str], whe
             )
 
 
-def _part(kind: str, node: Node, known: set[str], made: set[str], parameters: set[str], where: str) -> None:
+def _part(kind: str, node: Node, symbols: set[str], made: set[str], parameters: set[str], where: str) -> None:
     section = Section(node, kind)
     required, others = PARTS[kind]
     for key in (*required, *others):
@@ -341,7 +341,7 @@ def _part(kind: str, node: Node, known: set[str], made: set[str], parameters: se
                     f"{kind}: '{value.value}' is not a node of the place; {', '.join(ends) or 'none'} was expected"
                 )
         elif key in ("rate", "storage") or (key == "initial" and value.value not in _STARTS):
-            _expression(value, known, f"{key} of {kind}")
+            _expression(value, symbols, f"{key} of {kind}")
         elif key in ("share", "level") and value.value not in parameters:
             raise value.error(f"{kind}: {key} is a parameter, one of {', '.join(sorted(parameters))}")
     if kind == "flow" and not {"from", "into"} & set(node.value):

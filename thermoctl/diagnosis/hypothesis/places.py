@@ -104,12 +104,14 @@ def _rests(plant: Plant, f: Flow) -> bool:
     """Is a flow zero if all inputs are zero, at any temperatures?"""
     if any(e.op == "delay" for e in ex.walk(f.rate)):
         return False
-    at = {
+    values = {
         **{p.name: p.value for p in plant.parameters.values()},
         **dict.fromkeys(plant.inputs, 0.0),
         "t": 0.0,
     }
-    return all(float(ex.evaluate(f.rate, {**at, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0))
+    return all(
+        float(ex.evaluate(f.rate, {**values, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0)
+    )
 
 
 def _joule_flows(rig: Rig) -> Iterator[Place]:
@@ -181,17 +183,21 @@ def _displacements(rig: Rig) -> Iterator[Place]:
 
 
 def _members(rig: Rig) -> Iterator[Place]:
-    for at in _displacements(rig):
+    for displacement in _displacements(rig):
         for node in rig.signals("T"):
-            yield Place(node, {**at.symbols, "T": name(node)}, output=at.output)
+            yield Place(node, {**displacement.symbols, "T": name(node)}, output=displacement.output)
 
 
 def _bending_pairs(rig: Rig) -> Iterator[Place]:
-    for at in _displacements(rig):
+    for displacement in _displacements(rig):
         temperatures = rig.signals("T")
         for k, a in enumerate(temperatures):
             for b in temperatures[k + 1 :]:
-                yield Place(f"{a}-{b}", {**at.symbols, "TA": name(a), "TB": name(b)}, output=at.output)
+                yield Place(
+                    f"{a}-{b}",
+                    {**displacement.symbols, "TA": name(a), "TB": name(b)},
+                    output=displacement.output,
+                )
 
 
 def _voltages(rig: Rig) -> Iterator[Place]:
@@ -208,12 +214,12 @@ def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
     node = rig.physics.nodes.get(f.source or "")
     if node is None or node.name in (*rig.temperatures, *rig.velocities, *rig.position_of.values()):
         return None
-    known = {p.name: p.value for p in rig.physics.parameters.values()}
+    values = {p.name: p.value for p in rig.physics.parameters.values()}
     for e in ex.walk(f.rate):
         if e.op == "sqrt" and node.name in ex.names(e):
             return e, e.args[0], 0.5
-        if e.op == "**" and node.name in ex.names(e.args[0]) and ex.names(e.args[1]) <= known.keys():
-            return e, e.args[0], float(ex.evaluate(e.args[1], known))
+        if e.op == "**" and node.name in ex.names(e.args[0]) and ex.names(e.args[1]) <= values.keys():
+            return e, e.args[0], float(ex.evaluate(e.args[1], values))
     head = f.rate
     while head.op in ("*", "/"):
         factors = [a for a in head.args if node.name in ex.names(a)]
@@ -239,8 +245,8 @@ def _levels(rig: Rig) -> Iterator[Place]:
 
 def _orifices(rig: Rig) -> Iterator[Place]:
     for f in rig.physics.flows.values():
-        if found := outlet(rig, f):
-            yield Place(f.name, flow=f.name, exponent=found[2])
+        if parts := outlet(rig, f):
+            yield Place(f.name, flow=f.name, exponent=parts[2])
 
 
 def _resistive(rig: Rig) -> Iterator[Place]:

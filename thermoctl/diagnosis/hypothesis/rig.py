@@ -45,10 +45,10 @@ def kind_of(unit: str | None) -> str:
     if unit in TEMPERATURE:
         return "temperature"
     try:
-        found = dimension(unit)
+        wanted = dimension(unit)
     except ValueError:
         return ""
-    return next((kind for kind, like in _KINDS.items() if dimension(like) == found), "")
+    return next((kind for kind, like in _KINDS.items() if dimension(like) == wanted), "")
 
 
 def zero_of(unit: str | None) -> float:
@@ -163,9 +163,9 @@ class Rig:
     def first_air(self, d: Excitation) -> float:
         """Return the ambient temperature at a recording's start, degC; 0 if there is none."""
         air = self.air or ""
-        known = self.plant.parameters.get(air) or self.plant.inputs.get(air)
-        start = d.first.get(air, known.value if isinstance(known, Parameter) else 0.0)
-        return float(start - zero_of(known.unit) if known else start)
+        source = self.plant.parameters.get(air) or self.plant.inputs.get(air)
+        start = d.first.get(air, source.value if isinstance(source, Parameter) else 0.0)
+        return float(start - zero_of(source.unit) if source else start)
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Return names that can stand for v, x, i or T: nodes, inputs and unread columns."""
@@ -173,25 +173,25 @@ class Rig:
         if kind == "v":
             if near in self.velocities:
                 return [near]
-            found = [
+            names = [
                 *self.velocities,
                 *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
             ]
-            return (found or self.guessed("v"))[:3]
+            return (names or self.guessed("v"))[:3]
         if kind == "x":
             if near in self.position_of:
                 return [self.position_of[near]]
             if self.position_of:
                 return list(self.position_of.values())
-            found = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
-            found += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
-            return (found or self.guessed("x"))[:3]
+            names = [i for i in p.inputs if self.kind(p.inputs[i]) == "length" and i in self.moving_inputs]
+            names += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
+            return (names or self.guessed("x"))[:3]
         if kind == "i":
-            found = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
-            found += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
-            return (found or self.guessed("i"))[:2]
-        found = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
-        return found + self.guessed("T")
+            names = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
+            names += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
+            return (names or self.guessed("i"))[:2]
+        names = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
+        return names + self.guessed("T")
 
     def guessed(self, kind: str) -> list[str]:
         """Return the columns that the plant does not read and whose name suggests v, x, i or T."""

@@ -25,7 +25,7 @@ PLACES = ("", "length", "voltage")  # kinds by unit of its position
 def motions(plant: Plant) -> dict[str, str]:
     """Return velocity nodes and their position nodes: the integral of a multiple of the velocity."""
     values = {p.name: p.value for p in plant.parameters.values()}
-    found = {}
+    positions = {}
     for x in plant.nodes.values():
         flows = [f for f in plant.flows.values() if x.name in (f.source, f.target)]
         if len(flows) != 1 or flows[0].target != x.name or flows[0].source is not None:
@@ -37,8 +37,8 @@ def motions(plant: Plant) -> dict[str, str]:
             driven = any(v in (f.source, f.target) for f in plant.flows.values())
             constant = ex.names(x.storage) | ex.names(ex.derivative(rate, v)) <= values.keys()
             if read == {v} and driven and constant and ex.evaluate(rate, {**values, v: 0.0}) == 0:
-                found[v] = x.name
-    return found
+                positions[v] = x.name
+    return positions
 
 
 class Structure(Rig):
@@ -69,11 +69,11 @@ class Structure(Rig):
     def _ambients(self) -> dict[str, int]:
         """Return the reference temperatures of heat losses: name -> number of losses."""
         stated = [i.name for i in self.physics.inputs.values() if i.role == "ambient"]
-        known = (
+        sources = (
             stated or self.heat_inputs,
             [p.name for p in self.physics.parameters.values() if p.unit in TEMPERATURE],
         )
-        for names in known:
+        for names in sources:
             count = dict.fromkeys(names, 0)
             for f in self.physics.flows.values():
                 ends = {e for e in (f.source, f.target) if e in self.temperatures}
@@ -118,7 +118,7 @@ class Structure(Rig):
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Return names that can stand for v, x, i or T; for T also unread columns without a guess."""
-        found = super().signals(kind, near)
+        names = super().signals(kind, near)
         if kind == "T":
-            found += [c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS)]
-        return found
+            names += [c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS)]
+        return names

@@ -25,18 +25,18 @@ from thermoctl.plant.simulation.simulate import SimulationError
 
 
 def with_laws(
-    case: Case, found: Searched, limits: Thresholds, say: Callable[[str], None] = lambda text: None
+    case: Case, result: Searched, limits: Thresholds, say: Callable[[str], None] = lambda text: None
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     No law is sought if the residual of the plant, or of one effect, is only noise. A law has smaller prior
     odds than the effect and cannot fit better."""
-    best = found.tried[0].fitted
+    best = result.tried[0].fitted
     if len(best.hypothesis.effects) <= 1 and only_noise(case, best, limits):
-        return found
-    tried = {w.fitted.hypothesis.keys: w for w in found.tried}
-    s = Search(case, limits, found.where, tried, set(found.seen), list(found.norms))
-    s.promised, s.refused = dict(found.promised), dict(found.refused)
+        return result
+    tried = {w.fitted.hypothesis.keys: w for w in result.tried}
+    s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
+    s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
     for parent in (s.tried[frozenset()], s.best):
         if case.budget.stopped() or only_noise(case, parent.fitted, limits):
@@ -71,29 +71,30 @@ def _laws(
         """Return minus the log prior odds of a law: for each term `missing` and `rare`, and its own cost."""
         return p.cost - term * len(p.terms)
 
-    found: list[tuple[Proposal, Weighed]] = []
+    refitted: list[tuple[Proposal, Weighed]] = []
     for alone in (True, False):
         some = [p for p in proposals if (len(p.terms) == 1) is alone]
         tried = refits(case, parent.fitted, some, cost, ahead - BEATEN - parent.score, say)
-        found += [(p, Weighed(f, parent.log_odds - cost(p))) for p, f in tried]
-        if max((w.score for _, w in found), default=-np.inf) < ahead:
+        refitted += [(p, Weighed(f, parent.log_odds - cost(p))) for p, f in tried]
+        if max((w.score for _, w in refitted), default=-np.inf) < ahead:
             break
     return [
-        _best([x for x in found if x[0].place == place], limits) for place in {p.place: 0 for p, _ in found}
+        _best([x for x in refitted if x[0].place == place], limits)
+        for place in {p.place: 0 for p, _ in refitted}
     ]
 
 
-def _best(found: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
+def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
     """Return the likeliest law at one place. Its `rivals` are the others that fit about as well."""
-    share = softmax(np.array([w.score for _, w in found]))
+    share = softmax(np.array([w.score for _, w in laws]))
     order = np.argsort(-share, kind="stable")
-    best = found[order[0]][1]
-    kinds = {found[order[0]][0].kind}
+    best = laws[order[0]][1]
+    kinds = {laws[order[0]][0].kind}
     rivals: list[tuple[Proposal, Fitted, float]] = []
     for k in order[1:]:
-        if share[k] > 1 - limits.set and found[k][0].kind not in kinds:
-            kinds.add(found[k][0].kind)
-            rivals.append((found[k][0], found[k][1].fitted, float(share[k])))
+        if share[k] > 1 - limits.set and laws[k][0].kind not in kinds:
+            kinds.add(laws[k][0].kind)
+            rivals.append((laws[k][0], laws[k][1].fitted, float(share[k])))
     *effects, law = best.fitted.hypothesis.effects
     hypothesis = Hypothesis((*effects, replace(law, rivals=tuple(rivals))))
     return replace(best, fitted=replace(best.fitted, hypothesis=hypothesis))

@@ -26,26 +26,26 @@ class Curve:
     law: np.ndarray
 
 
-def curve(at: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
+def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
     None for a law with a memory or of a storage. The free function is the law plus a fit to its residual."""
-    found = [s for t in p.terms for s in t.signals]
-    if not found or p.place.part != "flow" or any(t.form.memory for t in p.terms):
+    signals = [s for t in p.terms for s in t.signals]
+    if not signals or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
-    s = found[0]
-    known = {q: v.value for q, v in plant.parameters.items()}
-    values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+    s = signals[0]
+    parameters = {q: v.value for q, v in plant.parameters.items()}
+    values = [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
     flows = [
-        np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **known}), float), d.t.shape)
-        for run, d in zip(at.runs, at.metric.drives, strict=True)
+        np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **parameters}), float), d.t.shape)
+        for run, d in zip(linear.runs, linear.metric.drives, strict=True)
     ]
     knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES + 4)))
     parts = [pieces(v, knots) for v in values]
     whole = np.concatenate(parts)
     line = np.linalg.lstsq(whole, np.concatenate(flows), rcond=None)[0]
-    rest = at.target - at.columns(p.place, [q[:, None] for q in flows])[:, 0]
-    u, w, v = np.linalg.svd(at.columns(p.place, parts), full_matrices=False)
+    rest = linear.target - linear.columns(p.place, [q[:, None] for q in flows])[:, 0]
+    u, w, v = np.linalg.svd(linear.columns(p.place, parts), full_matrices=False)
     seen = w > SEEN * w[0]  # the plant's own parameters absorb the others
     noise = max(float(np.mean(rest**2)), 1.0)
     extra = v[seen].T @ ((u.T @ rest)[seen] / w[seen])

@@ -144,15 +144,15 @@ class Term:
 
     def filling(self, number: int) -> Expr:
         """Return the rate of change of the term's memory."""
-        known = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
-        known |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
+        symbols = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
+        symbols |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
         text = ex.parse(MEMORIES[self.form.memory or ""].rate)
-        return ex.substitute(text, lambda e: known.get(str(e.value)) if e.op == "name" else None)
+        return ex.substitute(text, lambda e: symbols.get(str(e.value)) if e.op == "name" else None)
 
     def memory_text(self, number: int) -> str:
         """Return the memory of the term in words."""
-        known = {k: f"{k}{number}" for k in self.form.shapes} | {k: f"{v:.4g}" for k, v in self.clock.items()}
-        return MEMORIES[self.form.memory or ""].words.format(z=readable(self.lagged(number)), **known)
+        words = {k: f"{k}{number}" for k in self.form.shapes} | {k: f"{v:.4g}" for k, v in self.clock.items()}
+        return MEMORIES[self.form.memory or ""].words.format(z=readable(self.lagged(number)), **words)
 
     @property
     def clock(self) -> dict[str, float]:
@@ -187,32 +187,32 @@ class Family:
 
     def values(self, run: Values, t: np.ndarray) -> np.ndarray:
         """Return the values (N, count * sizes) of all terms along a trajectory, each size at 1."""
-        known: dict[str, Any] = {**self.shapes, "pi": np.pi}
+        symbols: dict[str, Any] = {**self.shapes, "pi": np.pi}
         for symbol, s in zip("zw", self.signals, strict=False):
             value = s.along(run, t)
-            known[symbol] = ((value - s.centre) / s.size)[:, None]
+            symbols[symbol] = ((value - s.centre) / s.size)[:, None]
             if symbol == "z" and s.kelvin is not None:
-                known["T"] = (value + s.kelvin)[:, None]
+                symbols["T"] = (value + s.kelvin)[:, None]
         if self.form.memory:
-            known["m"] = MEMORIES[self.form.memory].along(t, known["z"][:, 0], self.shapes, self.duration)
+            symbols["m"] = MEMORIES[self.form.memory].along(t, symbols["z"][:, 0], self.shapes, self.duration)
         out = np.empty((len(t), self.count, len(self.form.sizes)))
         for k, q in enumerate(self.form.sizes):
             one = {o: float(o == q) for o in self.form.sizes}
             with np.errstate(all="ignore"):
-                out[:, :, k] = ex.evaluate(self.form.text, {**known, **one})
+                out[:, :, k] = ex.evaluate(self.form.text, {**symbols, **one})
         return out.reshape(len(t), -1)
 
 
 def families(
-    found: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
+    first: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
 ) -> list[Family]:
-    """Return every form at its first values over each signal of `found`. `every`: possible second signals."""
+    """Return every form at its first values over each signal of `first`. `every`: possible second signals."""
     out = []
     for form in library():
         if form.of == "none":
             out.append(Family(form, (), {}, duration, sample))
             continue
-        for z in found:
+        for z in first:
             fits = {"absolute": z.kelvin is not None, "position": z.position, "input": z.recorded}
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = _grid(form, z, duration)

@@ -111,41 +111,41 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
     nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:
         nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
-    at = tracked(case, parent, nodes)
-    likely = sorted(at.explained, key=lambda n: -at.explained[n])[:NODES]
-    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, at.runs)]
-    free = _ranked(at, combos)
+    linear = tracked(case, parent, nodes)
+    likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
+    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, linear.runs)]
+    free = _ranked(linear, combos)
     chosen = free[:COMBINATIONS]
     pool: list[Found] = []
     for place in dict.fromkeys(p for _, p, _ in chosen):
-        found = [s for _, p, s in chosen if p == place]
+        first = [s for _, p, s in chosen if p == place]
         every = [s for _, p, s in free if p == place][:SECOND]
-        pool += _singles(at, place, found, every)
+        pool += _singles(linear, place, first, every)
     pool.sort(key=lambda f: -f.gain)
-    pool = sorted([*pool, *(_zoomed(at, f) for f in _varied(pool))], key=lambda f: -f.gain)
+    pool = sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool))], key=lambda f: -f.gain)
     base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
-    out = [_proposal(at, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
+    out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
-        out += _sums(at, place, [f for f in pool if f.place == place], base)
+        out += _sums(linear, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
-    return _mixed(out), at
+    return _mixed(out), linear
 
 
-def _ranked(at: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
+def _ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
     """Return the predicted gain of a free function of a signal at each place, the best first.
 
     Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
     combinations with the largest gain in energy, and only these are returned."""
-    found = []
+    scored = []
     for place, s in combos:
-        values = [s.along(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        values = [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
         knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
-        x = at.columns(place, [pieces(v, knots) for v in values])
-        found.append((_energy(x, at.target), place, s, x))
-    found.sort(key=lambda f: -f[0])
+        x = linear.columns(place, [pieces(v, knots) for v in values])
+        scored.append((_energy(x, linear.target), place, s, x))
+    scored.sort(key=lambda f: -f[0])
     out = [
-        (_promise(at, x)[0] - 0.5 * x.shape[1] * float(np.log(len(at.target))), place, s)
-        for _, place, s, x in found[:RANKED]
+        (_promise(linear, x)[0] - 0.5 * x.shape[1] * float(np.log(len(linear.target))), place, s)
+        for _, place, s, x in scored[:RANKED]
     ]
     return sorted(out, key=lambda f: -f[0])
 
@@ -164,34 +164,34 @@ def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
 
 
-def _promise(at: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
+def _promise(linear: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes."""
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
-    c = np.linalg.lstsq(x / scale, at.target, rcond=1e-8)[0] / scale
-    return at.above(at.target - x @ c), c
+    c = np.linalg.lstsq(x / scale, linear.target, rcond=1e-8)[0] / scale
+    return linear.above(linear.target - x @ c), c
 
 
-def _singles(at: Tracked, place: Place, found: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
+def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
     """Return the terms at a place, the best KEPT of each form over each signal."""
-    still = at.columns(place, [np.ones((len(d.t), 1)) for d in at.metric.drives])
+    still = linear.columns(place, [np.ones((len(d.t), 1)) for d in linear.metric.drives])
     out = []
-    for part in _chunks(families(found, every, at.duration, at.sample)):
+    for part in _chunks(families(first, every, linear.duration, linear.sample)):
         flows = [
             np.concatenate([f.values(run, d.t) for f in part], axis=1)
-            for run, d in zip(at.runs, at.metric.drives, strict=True)
+            for run, d in zip(linear.runs, linear.metric.drives, strict=True)
         ]
-        x = at.columns(place, flows)
+        x = linear.columns(place, flows)
         ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
         for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
-            out += _best(at, place, f, own, still if f.signals else np.zeros_like(still))
+            out += _best(linear, place, f, own, still if f.signals else np.zeros_like(still))
     return out
 
 
-def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
+def _chunks(every: Sequence[Family]) -> Iterator[list[Family]]:
     """Yield families in groups of CHUNK terms and more."""
     part: list[Family] = []
-    for f in found:
+    for f in every:
         part.append(f)
         if sum(q.count for q in part) >= CHUNK:
             yield part
@@ -200,34 +200,35 @@ def _chunks(found: Sequence[Family]) -> Iterator[list[Family]]:
         yield part
 
 
-def _best(at: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
+def _best(linear: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:
     """Return the KEPT terms of a family that explain most, without those that are nearly constant."""
     n = len(f.form.sizes)
     with np.errstate(all="ignore"):
         square = np.einsum("rk,rk->k", x, x)
-        gain = (at.target @ x) ** 2 / square
-        alike = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
+        gain = (linear.target @ x) ** 2 / square
+        nearly_constant = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
     if n > 1:
-        gain = np.repeat([_energy(own, at.target) for own in np.split(x, f.count, axis=1)], n)
-    usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~alike)
+        gain = np.repeat([_energy(own, linear.target) for own in np.split(x, f.count, axis=1)], n)
+    usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~nearly_constant)
     gain = np.where(usable, gain, -1.0)[::n]
     order = [k for k in np.argsort(-gain, kind="stable")[:KEPT] if gain[k] >= 0]
     return [Found(float(gain[k]), place, f.term(k), x[:, k * n : (k + 1) * n].copy()) for k in order]
 
 
-def _zoomed(at: Tracked, found: Found) -> Found:
+def _zoomed(linear: Tracked, chosen: Found) -> Found:
     """Return a term with better values of its shapes, searched on finer and finer grids about them."""
-    t = found.term
+    t = chosen.term
     grid = {q: np.unique(s.scaled(s.values, t.signals[0], t.duration)) for q, s in t.form.shapes.items()}
     for _ in range(ZOOMS if grid else 0):
-        grid = {q: _between(v, found.term.shapes[q]) for q, v in grid.items()}
+        grid = {q: _between(v, chosen.term.shapes[q]) for q, v in grid.items()}
         f = Family(t.form, t.signals, combined(grid), t.duration, t.sample)
-        x = at.columns(
-            found.place, [f.values(run, d.t) for run, d in zip(at.runs, at.metric.drives, strict=True)]
+        x = linear.columns(
+            chosen.place,
+            [f.values(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)],
         )
-        best = _best(at, found.place, f, x, np.zeros((len(x), 1)))[:1]
-        found = max([found, *best], key=lambda b: b.gain)
-    return found
+        best = _best(linear, chosen.place, f, x, np.zeros((len(x), 1)))[:1]
+        chosen = max([chosen, *best], key=lambda b: b.gain)
+    return chosen
 
 
 def _between(values: np.ndarray, v: float) -> np.ndarray:
@@ -245,44 +246,44 @@ def _varied(pool: Sequence[Found]) -> list[Found]:
 
 
 def _proposal(
-    at: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, float]
+    linear: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, float]
 ) -> Proposal:
-    promise, c = _promise(at, x)
+    promise, c = _promise(linear, x)
     p = Proposal(place, law, tuple(map(float, c)), promise, *base)
     dims = len(c) + p.shapes
-    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(at.target))))
+    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(linear.target))))
 
 
-def _sums(at: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
+def _sums(linear: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
     """Return sums of two and three terms at a place.
 
     Terms are added one by one to the best term, and to the best pairs. A pair may explain much where each of
     its terms alone does not, because the plant's own parameters imitate it. Terms that do not reverse with
     the signal that drives the flow are unlikely: so the best pairs without them are tried, too."""
     likely = [f for f in pool if f.term.reverses is not False]
-    found = _pairs(at, pool) + (_pairs(at, likely) if len(likely) < len(pool) else [])
+    couples = _pairs(linear, pool) + (_pairs(linear, likely) if len(likely) < len(pool) else [])
     pairs = []
-    for a, b in found:
+    for a, b in couples:
         x = np.concatenate([a.columns, b.columns], axis=1)
-        pairs.append((_proposal(at, place, (a.term, b.term), x, base), x))
+        pairs.append((_proposal(linear, place, (a.term, b.term), x, base), x))
     pairs.sort(key=lambda p: -p[0].score)
     starts: list[tuple[tuple[Term, ...], np.ndarray]] = [((f.term,), f.columns) for f in pool[:1]]
     starts += [(p.terms, x) for p, x in pairs[:GROWN]]
     out = [p for p, _ in pairs]
     for law, columns in starts:
         while len(law) < TERMS:
-            added = _added(at, law, columns, pool[:POOL])
+            added = _added(linear, law, columns, pool[:POOL])
             if added is None:
                 break
             law, columns = (*law, added.term), np.concatenate([columns, added.columns], axis=1)
-            out.append(_proposal(at, place, law, columns, base))
+            out.append(_proposal(linear, place, law, columns, base))
     return out
 
 
-def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence[Found]) -> Found | None:
+def _added(linear: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence[Found]) -> Found | None:
     """Return the term that explains most of the residual of a sum of terms; None if none is independent."""
     q, _ = np.linalg.qr(columns)
-    rest = at.target - q @ (q.T @ at.target)
+    rest = linear.target - q @ (q.T @ linear.target)
     best, most = None, 0.0
     for f in pool:
         own = f.columns - q @ (q.T @ f.columns)
@@ -295,14 +296,14 @@ def _added(at: Tracked, law: Sequence[Term], columns: np.ndarray, pool: Sequence
     return best
 
 
-def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
+def _pairs(linear: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
     """Return the pairs of terms that explain most together, one for each pair of forms with signals."""
     single = [f for f in pool if f.columns.shape[1] == 1][:PAIRED]
     if len(single) < 2:
         return []
     v = np.concatenate([f.columns for f in single], axis=1)
     v = v / np.linalg.norm(v, axis=0)
-    g, c = v.T @ at.target, np.clip(v.T @ v, -ALIKE, ALIKE)
+    g, c = v.T @ linear.target, np.clip(v.T @ v, -ALIKE, ALIKE)
     joint = (g[:, None] ** 2 + g[None] ** 2 - 2 * c * np.outer(g, g)) / (1 - c**2)
     joint = np.triu(np.where(abs(c) < ALIKE, joint, 0.0), 1)
     out: dict[Any, tuple[Found, Found]] = {}
@@ -314,22 +315,22 @@ def _pairs(at: Tracked, pool: Sequence[Found]) -> list[tuple[Found, Found]]:
     return list(out.values())
 
 
-def _mixed(found: Sequence[Proposal]) -> list[Proposal]:
+def _mixed(proposals: Sequence[Proposal]) -> list[Proposal]:
     """Return laws to refit: the best, the best of one term, one of each signal, then the rest by score.
 
     Laws of one term come early, because the predicted gain of sums is often too large."""
-    single = [p for p in found if len(p.terms) == 1]
+    single = [p for p in proposals if len(p.terms) == 1]
     signal: dict[Any, Proposal] = {}
     for p in single:
         if len(p.terms[0].signals) == 1:
             signal.setdefault((p.place, p.terms[0].signals), p)
-    chosen = [*found[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *found]
+    chosen = [*proposals[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *proposals]
     return _distinct(chosen)[:PROPOSALS]
 
 
-def _distinct(found: Sequence[Proposal]) -> list[Proposal]:
+def _distinct(proposals: Sequence[Proposal]) -> list[Proposal]:
     """Return proposals whose forms, signals or places differ."""
     out: dict[Any, Proposal] = {}
-    for p in found:
+    for p in proposals:
         out.setdefault(p.kind, p)
     return list(out.values())

@@ -234,13 +234,13 @@ def _celsius(e: Expr, its_unit: str | None) -> Expr:
 
 
 def _unit_of(plant: Plant, signal: str) -> str | None:
-    known = plant.inputs.get(signal) or plant.parameters.get(signal)
-    return known.unit if known else None
+    item = plant.inputs.get(signal) or plant.parameters.get(signal)
+    return item.unit if item else None
 
 
-def save_effect(found: Mapping[str, Any], label: str, folder: Path) -> Path:
+def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> Path:
     """Write the law of a diagnosis as an effect file of this name, and return its path. Raises InputError."""
-    law = (found.get("remainder") or {}).get("law")
+    law = (result.get("remainder") or {}).get("law")
     if not law:
         raise InputError(
             "this diagnosis has no law to save; one with `remainder.law` in diagnosis.json was expected"

@@ -137,10 +137,10 @@ def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
 
 def _scaling(plant: Plant, node: str) -> ex.Expr:
     """Return a node's storage, divided by its value at the plant's present parameters."""
-    known, storage = plant.parameters, plant.nodes[node].storage
-    if not ex.names(storage) & known.keys():
+    parameters, storage = plant.parameters, plant.nodes[node].storage
+    if not ex.names(storage) & parameters.keys():
         return ex.ONE
-    now = ex.substitute(storage, lambda e: num(known[e.value].value) if e.value in known else None)
+    now = ex.substitute(storage, lambda e: num(parameters[e.value].value) if e.value in parameters else None)
     return ex.div(storage, now)
 
 
@@ -208,15 +208,16 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
 
 def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     """Track the recordings from a fitted hypothesis. Raises SimulationError."""
-    at = _followed(case, f, nodes)
-    target = at.metric.project(np.concatenate(at.misfit))
-    duration = max(float(d.t[-1]) for d in at.metric.drives)
-    sample = max(float(np.median(np.diff(d.t))) for d in at.metric.drives)
-    of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in at.wide), strict=True)
+    followed = _followed(case, f, nodes)
+    target = followed.metric.project(np.concatenate(followed.misfit))
+    duration = max(float(d.t[-1]) for d in followed.metric.drives)
+    sample = max(float(np.median(np.diff(d.t))) for d in followed.metric.drives)
+    of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in followed.wide), strict=True)
     explained = {
-        n: _explained(at.metric.project(block_diag(*x)), target) for n, x in zip(nodes, of_nodes, strict=True)
+        n: _explained(followed.metric.project(block_diag(*x)), target)
+        for n, x in zip(nodes, of_nodes, strict=True)
     }
-    return Tracked(at.metric, target, at.runs, duration, sample, explained)
+    return Tracked(followed.metric, target, followed.runs, duration, sample, explained)
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
@@ -251,9 +252,9 @@ def _explained(x: np.ndarray, target: np.ndarray) -> float:
 
 def hat_functions(t: np.ndarray, knots: int) -> csr_matrix:
     """Return the hat functions (N, knots) of piecewise linear functions between evenly spaced knots."""
-    at, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
-    k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, knots - 2)
-    part = (t - at[k]) / (at[k + 1] - at[k])
+    knot_times, n = np.linspace(t[0], t[-1], knots), np.arange(len(t))
+    k = np.clip(np.searchsorted(knot_times, t, side="right") - 1, 0, knots - 2)
+    part = (t - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
     entries = np.concatenate([n, n]), np.concatenate([k, k + 1])
     return csr_matrix((np.concatenate([1 - part, part]), entries), shape=(len(t), knots))
 

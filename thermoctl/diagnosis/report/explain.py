@@ -11,45 +11,45 @@ from thermoctl.diagnosis.report.words import what_next
 SHOWN, LOST = 4, 3  # largest number of hypotheses; largest number of effects that were tried and lost
 
 
-def explain(found: Mapping[str, Any]) -> str:
+def explain(result: Mapping[str, Any]) -> str:
     """Return the verdict, its row and numbers, the likeliest hypotheses, the lost effects, the next step."""
-    lines = [f"verdict: {found['verdict']}, because {found['decision']['row']}"]
-    lines += [f"    {value:>10}  {meaning}" for meaning, value in figures.decision_rows(found)[1]]
-    heads, rows = figures.hypothesis_rows(found)
+    lines = [f"verdict: {result['verdict']}, because {result['decision']['row']}"]
+    lines += [f"    {value:>10}  {meaning}" for meaning, value in figures.decision_rows(result)[1]]
+    heads, rows = figures.hypothesis_rows(result)
     lines += ["".join(f"{cell:>16}" for cell in row[1:]) + f"  {row[0]}" for row in (heads, *rows[:SHOWN])]
     lost = "; ".join(
-        f"{row[0]} ({row[1]})" for row in figures.lost_rows(found)[1][: min(LOST, len(found["lost"]))]
+        f"{row[0]} ({row[1]})" for row in figures.lost_rows(result)[1][: min(LOST, len(result["lost"]))]
     )
     lines.append(f"tried and lost: {lost or 'nothing'}")
-    budget = "; the budget of refits ended the search" if found["truncated"] else ""
+    budget = "; the budget of refits ended the search" if result["truncated"] else ""
     lines.append(f"hypotheses not shown: {max(len(rows) - SHOWN, 0)} (in diagnosis.json){budget}")
-    lines.append(f"what next: {what_next(found)}")
+    lines.append(f"what next: {what_next(result)}")
     return "\n".join(lines)
 
 
-def why(found: Mapping[str, Any], asked: str) -> str:
+def why(result: Mapping[str, Any], asked: str) -> str:
     """Return in one line why an effect, `NAME` or `NAME at PLACE`, is or is not a finding."""
 
     def is_asked(entry: str) -> bool:
         """Return whether an `effect at place` is the one that was asked for."""
         return asked in (entry, entry.partition(" at ")[0])
 
-    for f in found["findings"]:
+    for f in result["findings"]:
         if is_asked(name := f"{f['effect']} at {f['where']}"):
             sure, confirmed = (figures.chance(f[k]) for k in ("probability", "confirmed"))
             return f"{name}: a finding, probability {sure}; that other data confirm it {confirmed}"
-    for e in found["lost"]:
+    for e in result["lost"]:
         if is_asked(name := f"{e['effect']} at {e['where']}"):
             beside = f" beside {' and '.join(e['beside'])}" if e["beside"] else ""
             return (
                 f"{name}: refitted{beside}; {e['reason']} (probability {figures.chance(e['probability'])}, "
                 f"log odds {figures.below(e['below_best'])})"
             )
-    for r in found["refused"]:
+    for r in result["refused"]:
         for name in filter(is_asked, r["effects"]):
             beside = " and ".join(e for e in r["effects"] if e != name)
             return f"{name}: {r['reason']}{f', beside {beside}' if beside else ''}"
-    promised = {name: gain for name, gain in found["promised"].items() if is_asked(name)}
+    promised = {name: gain for name, gain in result["promised"].items() if is_asked(name)}
     if promised:
         name = max(promised, key=lambda n: promised[n])
         return f"{name}: not refitted; to first order it gains at most {promised[name]:.1f} nats, others promised more"

@@ -89,9 +89,9 @@ class Output:
         return f"{'falls' if falls else 'rises'} from {first or a} to {b or 'an unknown amount'}"
 
 
-def outputs(found: Result) -> list[Output]:
+def outputs(result: Result) -> list[Output]:
     """Return the outputs in the plant's order."""
-    fit, rest = found["fit"], found["remainder"] or {}
+    fit, rest = result["fit"], result["remainder"] or {}
     return [
         Output(
             o,
@@ -102,7 +102,7 @@ def outputs(found: Result) -> list[Output]:
             rest.get("rms", {}).get(o),
             rest.get("over_noise", {}).get(o),
         )
-        for o, x in found["outputs"].items()
+        for o, x in result["outputs"].items()
     ]
 
 
@@ -154,22 +154,22 @@ def equation(finding: Result) -> str:
     return text
 
 
-def extends(found: Result) -> bool:
+def extends(result: Result) -> bool:
     """Return whether the result's plant has an effect or a law more than the original one."""
-    return bool(found["findings"] or (found["remainder"] or {}).get("law"))
+    return bool(result["findings"] or (result["remainder"] or {}).get("law"))
 
 
-def error_rows(found: Result) -> Rows:
+def error_rows(result: Result) -> Rows:
     """Return the rms errors by output."""
-    keys = [k for k in COLUMNS if extends(found) or not k.endswith("after")]
-    keys = [k for k in keys if any(o.errors[k] is not None for o in outputs(found))]
-    rows = [(o.label, number(o.noise), *(number(o.errors[k]) for k in keys)) for o in outputs(found)]
+    keys = [k for k in COLUMNS if extends(result) or not k.endswith("after")]
+    keys = [k for k in keys if any(o.errors[k] is not None for o in outputs(result))]
+    rows = [(o.label, number(o.noise), *(number(o.errors[k]) for k in keys)) for o in outputs(result)]
     return ("rms error of", "noise", *(COLUMNS[k] for k in keys)), rows
 
 
-def fit_rows(found: Result) -> Rows:
+def fit_rows(result: Result) -> Rows:
     """Return the fit of each recording in percent, those held out first."""
-    entries = found.get("recordings", ())
+    entries = result.get("recordings", ())
     keys = [k for k in COLUMNS if any(k in e["fit_percent"] for e in entries)]
     rows = [
         (
@@ -186,7 +186,7 @@ def percent(value: float | None) -> str:
     return NONE if value is None else f"{value:.1f}"
 
 
-def remainder_rows(found: Result) -> Rows:
+def remainder_rows(result: Result) -> Rows:
     """Return each output's error beyond its noise."""
     rows = [
         (
@@ -196,7 +196,7 @@ def remainder_rows(found: Result) -> Rows:
             number(o.left) if o.left else NONE,
             number(o.over_noise),
         )
-        for o in outputs(found)
+        for o in outputs(result)
     ]
     return (
         "output",
@@ -216,25 +216,25 @@ def parameter_rows(finding: Result) -> Rows:
     return ("parameter", "value, 95 %", "unit"), rows
 
 
-def alternative_rows(found: Result) -> Rows:
+def alternative_rows(result: Result) -> Rows:
     """Return the alternatives, the likeliest first, each with the reason why it is not named."""
     rows = [
         (_plain(a["effect"]), a["where"], chance(a["probability"]), a.get("why_not", ""))
-        for a in found["alternatives"][:ALTERNATIVES]
+        for a in result["alternatives"][:ALTERNATIVES]
     ]
     return ("alternative", "where", "probability", "but"), rows
 
 
-def decision_rows(found: Result) -> Rows:
+def decision_rows(result: Result) -> Rows:
     """Return the numbers that decided, in words."""
-    known = {k: v for k, v in found["decision"].items() if k != "row" and v is not None}
+    numbers = {k: v for k, v in result["decision"].items() if k != "row" and v is not None}
     return ("number", "value"), [
         (MEANINGS.get(k, f"probability of {_plain(k)}"), (number if k in RATIOS else chance)(v))
-        for k, v in known.items()
+        for k, v in numbers.items()
     ]
 
 
-def hypothesis_rows(found: Result) -> Rows:
+def hypothesis_rows(result: Result) -> Rows:
     """Return every hypothesis that was fitted."""
     heads = ("hypothesis", "log evidence", "log prior odds", "probability", "stands out", "remainder")
     return heads, [
@@ -250,11 +250,11 @@ def hypothesis_rows(found: Result) -> Rows:
             else ", ".join(map(chance, h["physics"])),
             chance(h["remainder"]),
         )
-        for h in found["hypotheses"]
+        for h in result["hypotheses"]
     ]
 
 
-def lost_rows(found: Result) -> Rows:
+def lost_rows(result: Result) -> Rows:
     """Return the effects that were tried and are no finding, and why, the closest first."""
     rows = [
         (
@@ -263,12 +263,12 @@ def lost_rows(found: Result) -> Rows:
             chance(e["probability"]),
             below(e["below_best"]),
         )
-        for e in found["lost"]
+        for e in result["lost"]
     ]
-    rows += [(_plain(" + ".join(r["effects"])), r["reason"], NONE, NONE) for r in found["refused"]]
-    tried = {f"{e['effect']} at {e['where']}" for e in (*found["lost"], *found["findings"])}
-    tried |= {n for r in found["refused"] for n in r["effects"]}
-    promised = sorted(((g, n) for n, g in found["promised"].items() if n not in tried), reverse=True)
+    rows += [(_plain(" + ".join(r["effects"])), r["reason"], NONE, NONE) for r in result["refused"]]
+    tried = {f"{e['effect']} at {e['where']}" for e in (*result["lost"], *result["findings"])}
+    tried |= {n for r in result["refused"] for n in r["effects"]}
+    promised = sorted(((g, n) for n, g in result["promised"].items() if n not in tried), reverse=True)
     rows += [
         (_plain(n), f"not fitted: to first order it gains at most {g:.1f} nats", NONE, NONE)
         for g, n in promised[:PROMISED]

@@ -33,26 +33,29 @@ WORTH = 0.5  # least correlation whose number is written into its cell
 TONES = {"consistent": "good", "explained": "good", "unexplained": "bad"}
 
 
-def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) -> None:
+def write_report(diagnosis: Diagnosis, result: Mapping[str, Any], path: str | Path) -> None:
     """Write report.html of a diagnosis; `result`: the content of its diagnosis.json."""
-    drawn = _ordered(curves(found), outputs(result), figures.extends(result))
+    drawn = _ordered(curves(diagnosis), outputs(result), figures.extends(result))
     more = "".join(_compared(c, result) for c in drawn[1:])
     rest = folded(f"{len(drawn) - 1} more curves", f'<div class="grid">{more}</div>' if more else "")
     law = (result["remainder"] or {}).get("law")
     sections = [
         ("", _lead(result) + "".join(_compared(c, result, True) for c in drawn[:1])),
         ("What next", _next(result)),
-        ("The likeliest" if result["verdict"] == "ambiguous" else "What was found", _findings(found, result)),
-        ("A law for what remains", law_section(found.law, law)),
+        (
+            "The likeliest" if result["verdict"] == "ambiguous" else "What was found",
+            _findings(diagnosis, result),
+        ),
+        ("A law for what remains", law_section(diagnosis.law, law)),
         ("How well it fits", _worth(result) + rest),
         ("The error that is left", _remains(drawn, result)),
-        ("Where", _place(found, result)),
-        ("Parameters", _parameters(found)),
+        ("Where", _place(diagnosis, result)),
+        ("Parameters", _parameters(diagnosis)),
         ("Why this verdict", _why(result)),
         ("What could not have been seen", _unseen(result)),
-        ("How this was made", _made(found, result)),
+        ("How this was made", _made(diagnosis, result)),
     ]
-    case = found.case
+    case = diagnosis.case
     of = dict.fromkeys([*(t.name for t in case.tables), *(c.recording for c in drawn)])
     note = f"{case.plant.title} · {', '.join(of)}"
     write_text(path, page("Diagnosis", [(h, b) for h, b in sections if b], note))
@@ -60,12 +63,12 @@ def write_report(found: Diagnosis, result: Mapping[str, Any], path: str | Path) 
 
 def _ordered(every: Sequence[Curve], rows: Sequence[Output], extended: bool) -> list[Curve]:
     """Return the curves to draw. The first is of the output that matters most, held out if possible."""
-    told = max(rows, key=lambda o: o.gain if extended else o.over("refit_only")).name if rows else ""
+    first_output = max(rows, key=lambda o: o.gain if extended else o.over("refit_only")).name if rows else ""
 
     def weight(c: Curve) -> tuple[bool, bool, float]:
-        """Return the sort key: is it of that output, is it held out, its error over the noise."""
+        """Return the sort key: is the curve of `first_output`, is it held out, its error over the noise."""
         noise = next((o.noise for o in rows if o.name == c.output), 0.0) or 1.0
-        return c.output == told, c.held_out, (c.rms("refit_only") or 0.0) / noise
+        return c.output == first_output, c.held_out, (c.rms("refit_only") or 0.0) / noise
 
     every = sorted(every, key=weight, reverse=True)
     rest = sorted(every[1:], key=lambda c: weight(c)[2], reverse=True)
@@ -111,9 +114,9 @@ def _table(rows: Rows, caption: str = "") -> str:
     return table(*rows, caption) if rows[1] else ""
 
 
-def _findings(found: Diagnosis, result: Mapping[str, Any]) -> str:
+def _findings(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
     body = ""
-    for f, e in zip(result["findings"], found.shown, strict=True):
+    for f, e in zip(result["findings"], diagnosis.shown, strict=True):
         effect, end = e.candidate.effect, ""
         for n in f["parameters"]:
             end = n.removeprefix(figures.short(n, f)) or end
@@ -161,36 +164,38 @@ def _remains(drawn: Sequence[Curve], result: Mapping[str, Any]) -> str:
     return body + _table(figures.remainder_rows(result)) + _items(facts)
 
 
-def _place(found: Diagnosis, result: Mapping[str, Any]) -> str:
+def _place(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
     marked: set[str] = set()
-    for e in found.shown:
+    for e in diagnosis.shown:
         place = e.candidate.place
         marked |= {place.where, *place.nodes.values(), *(n for n in (place.flow, place.output) if n)}
     words = "Red: where the findings sit." if marked else "Nothing is marked: nothing is named."
     remainder = result["remainder"]
     if not marked and remainder and remainder["node"]:
         marked, words = {remainder["node"]}, "Red: the node where the remainder enters."
-    broad, narrow = (drawing(found.case.plant, marked, width, title=False) for width in (BROAD, NARROW))
+    broad, narrow = (drawing(diagnosis.case.plant, marked, width, title=False) for width in (BROAD, NARROW))
     return figure(broad, f"The network of the plant file. {words}", narrow)
 
 
-def _parameters(found: Diagnosis) -> str:
-    before, after = _estimates(found.null.fit), _estimates(found.final.fit)
+def _parameters(diagnosis: Diagnosis) -> str:
+    before, after = _estimates(diagnosis.null.fit), _estimates(diagnosis.final.fit)
     rows = []
     for n, e in after.items():
-        refit, first = before.get(n), found.case.plant.parameters.get(n)
-        told = [] if e.state == "ok" else [e.state]
-        told += ["trades with " + ", ".join(e.trades_with[:3])] if e.trades_with else []
-        if refit and found.extends:
+        refit, first = before.get(n), diagnosis.case.plant.parameters.get(n)
+        remarks = [] if e.state == "ok" else [e.state]
+        remarks += ["trades with " + ", ".join(e.trades_with[:3])] if e.trades_with else []
+        if refit and diagnosis.extends:
             moved = abs(refit.value - e.value)
             least = max(MOVED * np.hypot(e.sd, refit.sd), MOVED_SHARE * abs(e.value))
-            told += ["stood in for what was missing"] if moved > least else []
-            told += ["refitted, at the end of its range"] if refit.state == "at bound" else []
-        values = figures.with_interval(e.value, e.sd), unit(e.unit), "; ".join(told) or "ok"
-        rows.append((n, first and first.value, *([refit and refit.value] if found.extends else []), *values))
-    came = ("as it came", "refitted", "extended") if found.extends else ("as it came", "refitted")
+            remarks += ["stood in for what was missing"] if moved > least else []
+            remarks += ["refitted, at the end of its range"] if refit.state == "at bound" else []
+        values = figures.with_interval(e.value, e.sd), unit(e.unit), "; ".join(remarks) or "ok"
+        rows.append(
+            (n, first and first.value, *([refit and refit.value] if diagnosis.extends else []), *values)
+        )
+    came = ("as it came", "refitted", "extended") if diagnosis.extends else ("as it came", "refitted")
     heads = ("parameter", *came, "unit", "state")
-    return table(heads, rows) + folded("Correlations", _matrix(found.final.fit)) if rows else ""
+    return table(heads, rows) + folded("Correlations", _matrix(diagnosis.final.fit)) if rows else ""
 
 
 def _estimates(fit: Fit) -> dict[str, Estimate]:
@@ -269,8 +274,8 @@ def _experiment(entry: Mapping[str, Any] | None) -> str:
     )
 
 
-def _made(found: Diagnosis, result: Mapping[str, Any]) -> str:
-    case, budget = found.case, found.case.budget
+def _made(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
+    case, budget = diagnosis.case, diagnosis.case.budget
     files = ", ".join(Path(t.path).name for t in case.tables)
     ended = " The budget ended the search." if result["truncated"] else ""
     return _items(

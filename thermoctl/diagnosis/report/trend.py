@@ -40,33 +40,33 @@ def trends(
             if not p.amplitude or p.name not in e.own:
                 continue
             own = _sizes(posterior, f, e.own[p.name])
-            found = [
+            sizes = [
                 *old.get((*e.key, p.name), ()),
                 *(
                     {
                         "recording": t.name,
-                        "begun_s": None if math.isnan(at) else at,
+                        "begun_s": None if math.isnan(date) else date,
                         "value": float(v),
                         "sd": float(sd),
                     }
-                    for t, at, (v, sd) in zip(case.tables, dates, own, strict=True)
+                    for t, date, (v, sd) in zip(case.tables, dates, own, strict=True)
                     if math.isfinite(sd)
                 ),
             ]
-            found.sort(key=lambda r: (r["begun_s"] is None, r["begun_s"] or 0.0))
-            dated = [r for r in found if r["begun_s"] is not None]
+            sizes.sort(key=lambda r: (r["begun_s"] is None, r["begun_s"] or 0.0))
+            dated = [r for r in sizes if r["begun_s"] is not None]
             slope, error = line([r["begun_s"] for r in dated], [(r["value"], r["sd"]) for r in dated])
-            known = math.isfinite(error)
+            is_known = math.isfinite(error)
             out.append(
                 {
                     "effect": e.key[0],
                     "where": e.key[1],
                     "parameter": p.name,
                     "unit": f.plant.parameters[e.own[p.name]].unit,
-                    "recordings": found,
-                    "per_month": slope if known else None,
-                    "per_month_sd": error if known else None,
-                    "changes": known and abs(slope) > SIGNIFICANT * error,
+                    "recordings": sizes,
+                    "per_month": slope if is_known else None,
+                    "per_month_sd": error if is_known else None,
+                    "changes": is_known and abs(slope) > SIGNIFICANT * error,
                 }
             )
     return out
@@ -78,11 +78,11 @@ def earlier_trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
     if path is None or not path.exists():
         return ()
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        result = json.loads(path.read_text(encoding="utf-8"))
         return [
             {k: str(t[k]) for k in ("effect", "where", "parameter")}
             | {"recordings": [_read_size(r) for r in t["recordings"]]}
-            for t in found.get("trends", ())
+            for t in result.get("trends", ())
         ]
     except OSError as e:
         raise InputError(f"{path}: cannot be read: {e.strerror}") from None
@@ -105,13 +105,13 @@ def _read_size(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {"recording": str(entry["recording"]), "begun_s": None, **numbers}
 
 
-def trend_notes(found: Sequence[Mapping[str, Any]]) -> list[str]:
+def trend_notes(entries: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a sentence for each significant trend."""
     return [
         f"{t['effect']} at {t['where']} changes with the recordings' dates: {t['parameter']} by {t['per_month']:+.3g} "
         f"± {1.96 * t['per_month_sd']:.2g} {t['unit'] or ''} in 30 days, {_day(t['recordings'][0])} to "
         f"{_day([r for r in t['recordings'] if r['begun_s'] is not None][-1])}"
-        for t in found
+        for t in entries
         if t["changes"]
     ]
 

@@ -64,11 +64,11 @@ class Visible:
         }
 
 
-def not_seen(found: Diagnosis) -> list[dict[str, Any]]:
+def not_seen(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return `not_seen` of a result: the smallest size of each effect that would have shown."""
-    null = next(w.fitted for w in found.searched.tried if not w.fitted.hypothesis.effects)
-    norms = [n for n in found.searched.norms if sized(n.column.item[0].effect)]
-    seen = _best((n, None) for n in norms) if norms else visible(found.case, null, found.null.average)
+    null = next(w.fitted for w in diagnosis.searched.tried if not w.fitted.hypothesis.effects)
+    norms = [n for n in diagnosis.searched.norms if sized(n.column.item[0].effect)]
+    seen = _best((n, None) for n in norms) if norms else visible(diagnosis.case, null, diagnosis.null.average)
     return [v.entry() for v in seen if v.reason is None]
 
 
@@ -78,10 +78,10 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
     metric = Rows(Plain(case, null, ROWS), average, True)
     rig = Structure(null.rough_plant, metric.drives, [t.columns for t in case.tables])
-    at = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
-    found = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
-    columns = (column for c in found for g in groups_of(c, metric) for column in g.columns())
-    return _best(_norms(metric, at, columns))
+    trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
+    placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
+    columns = (column for c in placed for g in groups_of(c, metric) for column in g.columns())
+    return _best(_norms(metric, trajectories, columns))
 
 
 Rms = Mapping[str, tuple[float, float]]
@@ -117,10 +117,12 @@ def _times(column: Column, left: float) -> float:
     return SEEN / left if sized_ else max(SEEN / left, 1 / NEAR)
 
 
-def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) -> Iterator[tuple[Norms, Rms]]:
+def _norms(
+    metric: Rows, trajectories: Sequence[Trajectory], columns: Iterable[Column]
+) -> Iterator[tuple[Norms, Rms]]:
     readings = np.concatenate([d.y for d in metric.drives])
     names = metric.model.outputs
-    for part, plain in directions(metric, at, columns):
+    for part, plain in directions(metric, trajectories, columns):
         rows = plain * metric.weight[:, None]
         full = np.linalg.norm(rows, axis=0)
         left = np.linalg.norm(metric.project(rows), axis=0)
@@ -136,12 +138,12 @@ def _norms(metric: Rows, at: Sequence[Trajectory], columns: Iterable[Column]) ->
 
 def _energies(metric: Rows, plain: np.ndarray) -> dict[int, np.ndarray]:
     """Return the sum of squares (k,) of rows (rows, k), not whitened, by output."""
-    found: dict[int, np.ndarray] = {}
-    at = 0
+    energies: dict[int, np.ndarray] = {}
+    begin = 0
     for c in metric.plain.coordinates.channels:
-        found[c.output] = found.get(c.output, 0.0) + np.sum(plain[at : at + c.rows] ** 2, axis=0)
-        at += c.rows
-    return found
+        energies[c.output] = energies.get(c.output, 0.0) + np.sum(plain[begin : begin + c.rows] ** 2, axis=0)
+        begin += c.rows
+    return energies
 
 
 def _visible(column: Column, full: float, left: float) -> Visible:
@@ -153,9 +155,12 @@ def _visible(column: Column, full: float, left: float) -> Visible:
         return Visible(c, "", None, np.inf, IMITATED)
     if sizes:
         absent = parameter_values(c, shape, [0.0 for _ in dim])
-        found = parameter_values(c, shape, [SEEN / left * v for v in dim])
-        p = next(p for p in sizes if found[p.name] != absent[p.name])
-        smallest, most = abs(found[p.name] - absent[p.name]), max(abs(np.array(c.bounds(p)) - absent[p.name]))
+        values = parameter_values(c, shape, [SEEN / left * v for v in dim])
+        p = next(p for p in sizes if values[p.name] != absent[p.name])
+        smallest, most = (
+            abs(values[p.name] - absent[p.name]),
+            max(abs(np.array(c.bounds(p)) - absent[p.name])),
+        )
         return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if smallest > most else None)
     # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
     p = next(p for p in c.effect.parameters if p.shape)

@@ -26,24 +26,24 @@ LARGER = 1.1  # least error over the noise that is stated with the verdict `cons
 NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 
 
-def words(found: Result) -> str:
+def words(result: Result) -> str:
     """Return the findings, their worth, the remainder and the next step."""
-    return " ".join([*sentences(found), f"What next: {what_next(found)}"])
+    return " ".join([*sentences(result), f"What next: {what_next(result)}"])
 
 
-def sentences(found: Result) -> list[str]:
+def sentences(result: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
-    rows = outputs(found)
-    law = law_sentence((found["remainder"] or {}).get("law"))
-    told = [_found(found, rows), *_families(found), law]
-    if rows and (found["findings"] or law):
-        told.append(_gain(found, max(rows, key=lambda o: o.gain)))
-    return [text for text in (*told, _remainder(found, rows)) if text]
+    rows = outputs(result)
+    law = law_sentence((result["remainder"] or {}).get("law"))
+    texts = [_found(result, rows), *_families(result), law]
+    if rows and (result["findings"] or law):
+        texts.append(_gain(result, max(rows, key=lambda o: o.gain)))
+    return [text for text in (*texts, _remainder(result, rows)) if text]
 
 
-def what_next(found: Result) -> str:
+def what_next(result: Result) -> str:
     """Return the next step for a person."""
-    proposed = found.get("next_experiment")
+    proposed = result.get("next_experiment")
     if proposed and proposed.get("also_helpful"):
         return f"{proposed['also_helpful']} The best one inside them: {proposed['profile']}."
     if proposed:
@@ -51,12 +51,12 @@ def what_next(found: Result) -> str:
             f"Run the proposed experiment ({proposed['profile']}) and diagnose again with its recording; "
             "`thermoctl diagnose --resolve` does both."
         )
-    text = NEXT[found["verdict"]]
-    if found["verdict"] == "consistent" and _likely(found):
+    text = NEXT[result["verdict"]]
+    if result["verdict"] == "consistent" and _likely(result):
         text = PERHAPS
-    elif found["verdict"] in ("unexplained", "partly_explained") and _small(outputs(found)):
-        text = f"Use the extended plant. {SMALL}" if found["findings"] else SMALL
-    if found["truncated"]:
+    elif result["verdict"] in ("unexplained", "partly_explained") and _small(outputs(result)):
+        text = f"Use the extended plant. {SMALL}" if result["findings"] else SMALL
+    if result["truncated"]:
         text += " The budget of refits ended the search: more effects may be hidden."
     return text
 
@@ -88,14 +88,16 @@ def law_sentence(entry: Result | None) -> str:
         for n, p in entry["parameters"].items()
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
-    at = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
-    acts = f"a flow {at}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
+    ends = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
+    acts = (
+        f"a flow {ends}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
+    )
     chances = f"probability {chance(entry['probability'])}"
     return f"A law for it: {acts}, {entry['expression']}, with {values} ({chances})."
 
 
-def _likely(found: Result) -> list[Result]:
-    return [a for a in found["alternatives"] if a["probability"] >= LIKELY]
+def _likely(result: Result) -> list[Result]:
+    return [a for a in result["alternatives"] if a["probability"] >= LIKELY]
 
 
 def _small(rows: Sequence[Output]) -> bool:
@@ -103,48 +105,46 @@ def _small(rows: Sequence[Output]) -> bool:
     return bool(rows) and all(o.hidden for o in rows)
 
 
-def _found(found: Result, rows: Sequence[Output]) -> str:
-    if found["verdict"] == "consistent":
+def _found(result: Result, rows: Sequence[Output]) -> str:
+    if result["verdict"] == "consistent":
         over = max((o.over("refit_only") for o in rows), default=1.0)
         text = "The recordings agree with the plant within its sensors' noise"
         text += f" (errors up to {over:.2g} times it)" if over > LARGER else ""
-        perhaps = ", ".join(f"{name(a)} ({chance(a['probability'])})" for a in _likely(found)[:3])
+        perhaps = ", ".join(f"{name(a)} ({chance(a['probability'])})" for a in _likely(result)[:3])
         return text + (
             f", and yet something may be missing: {perhaps}." if perhaps else ": nothing is missing."
         )
-    if found["verdict"] == "ambiguous":
-        every = sorted([*found["findings"], *found["alternatives"]], key=lambda a: -a["probability"])
-        told = ", ".join(f"{name(a)} ({chance(a['probability'])}{_doubt(a)})" for a in every[:4])
+    if result["verdict"] == "ambiguous":
+        every = sorted([*result["findings"], *result["alternatives"]], key=lambda a: -a["probability"])
+        candidates = ", ".join(f"{name(a)} ({chance(a['probability'])}{_doubt(a)})" for a in every[:4])
         whole = [
-            f for f in found.get("families", ()) if _members(f) >= {(a["effect"], a["where"]) for a in every}
+            f for f in result.get("families", ()) if _members(f) >= {(a["effect"], a["where"]) for a in every}
         ]
         if whole:
             sure = chance(whole[0]["probability"])
-            return (
-                f"One of these is there (probability {sure}), and these recordings do not tell which: {told}."
-            )
+            return f"One of these is there (probability {sure}), and these recordings do not tell which: {candidates}."
         text = "Something is missing, but these recordings do not name it for sure"
-        return text + (f". Candidates, the likeliest first: {told}." if told else ".")
-    if found["findings"]:
-        names = [f"{name(f)} (probability {chance(f['probability'])})" for f in found["findings"]]
+        return text + (f". Candidates, the likeliest first: {candidates}." if candidates else ".")
+    if result["findings"]:
+        names = [f"{name(f)} (probability {chance(f['probability'])})" for f in result["findings"]]
         return f"Found: {listed(names)}."
-    law = (found["remainder"] or {}).get("law")
+    law = (result["remainder"] or {}).get("law")
     if law:
         follows = f"; it follows {listed(law['of'])}" if law["of"] else ""
         return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
     what = "A small systematic error stays" if _small(rows) else "Something is missing"
-    doubted = listed([name(a) for a in found["alternatives"] if a.get("why_not")][:2])
+    doubted = listed([name(a) for a in result["alternatives"] if a.get("why_not")][:2])
     fits = f" What would fit, and nothing else confirms: {doubted}." if doubted else ""
     return f"{what} that no effect of the catalogue explains.{fits}"
 
 
-def _families(found: Result) -> list[str]:
+def _families(result: Result) -> list[str]:
     """Return a sentence for each family of effects that imitate each other, unless `_found` has it."""
-    known = {(a["effect"], a["where"]) for a in (*found["findings"], *found["alternatives"])}
+    mentioned = {(a["effect"], a["where"]) for a in (*result["findings"], *result["alternatives"])}
     return [
         f"One of these is there (probability {chance(f['probability'])}): {' or '.join(map(name, f['effects']))}."
-        for f in found.get("families", ())
-        if found["verdict"] != "ambiguous" or not _members(f) >= known
+        for f in result.get("families", ())
+        if result["verdict"] != "ambiguous" or not _members(f) >= mentioned
     ]
 
 
@@ -156,25 +156,25 @@ def _doubt(alternative: Result) -> str:
     return f"; {alternative['why_not']}" if alternative.get("why_not") else ""
 
 
-def _gain(found: Result, o: Output) -> str:
-    many = len(found["findings"]) + bool((found["remainder"] or {}).get("law")) > 1
-    likely = f"With the likeliest{' ones' if many else ''}" if found["verdict"] == "ambiguous" else ""
+def _gain(result: Result, o: Output) -> str:
+    many = len(result["findings"]) + bool((result["remainder"] or {}).get("law")) > 1
+    likely = f"With the likeliest{' ones' if many else ''}" if result["verdict"] == "ambiguous" else ""
     came = o.size("before")
     alone = f"{o.size('refit_only')} after a refit alone" + (f" ({came} as the plant came)" if came else "")
     text = f"{likely or ('With them' if many else 'With it')} the error of {o.name} {o.change('refit_only', 'after', alone)}"
     if o.size("held_out_refit_only") and o.size("held_out_after"):
-        aside = str(found["fit"]["held_out"]).startswith("recordings")
+        aside = str(result["fit"]["held_out"]).startswith("recordings")
         where = "on recordings set aside" if aside else "in parts predicted from the others"
         text += f"; {where} it {o.change('held_out_refit_only', 'held_out_after')}"
     return text + "."
 
 
-def _remainder(found: Result, rows: Sequence[Output]) -> str:
-    r = found["remainder"]
-    if not r or not rows or found["verdict"] == "explained":
+def _remainder(result: Result, rows: Sequence[Output]) -> str:
+    r = result["remainder"]
+    if not r or not rows or result["verdict"] == "explained":
         return ""
     o = max(rows, key=lambda row: row.over_noise or 0.0)
-    if found["verdict"] == "ambiguous" and (o.over_noise or 0.0) < LARGER:
+    if result["verdict"] == "ambiguous" and (o.over_noise or 0.0) < LARGER:
         return ""  # a candidate explains it
     noise = size(o.noise, o.unit)
     if o.left:
@@ -183,7 +183,7 @@ def _remainder(found: Result, rows: Sequence[Output]) -> str:
         )
         text += f" and steps of {size(o.step, o.unit)} in its readings" if o.below_step else ""
     else:
-        if found["decision"].get("remains", 0.0) < NOT_RANDOM:
+        if result["decision"].get("remains", 0.0) < NOT_RANDOM:
             return ""
         text = f"What remains of {o.name} is no larger than its noise of {noise}, but not random"
     text += f"; it enters at {r['node']}" if r["node"] else ""

@@ -54,9 +54,9 @@ def foremost(directions: Iterable[Direction], places: int) -> list[Direction]:
     out = []
     for d in directions:
         effect, where = d.candidate.key
-        known = seen.setdefault(effect, set())
-        if where in known or len(known) < places:
-            known.add(where)
+        used = seen.setdefault(effect, set())
+        if where in used or len(used) < places:
+            used.add(where)
             out.append(d)
     return out
 
@@ -86,10 +86,10 @@ class Column:
     values: Mapping[str, float]
     scale: float
 
-    def changes(self, at: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    def changes(self, trajectory: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return its forces by state and its changes of outputs along a trajectory, all numbers finite."""
         try:
-            parts = self.overlay().changes(self.values, at)
+            parts = self.overlay().changes(self.values, trajectory)
         except (KeyError, ex.ExpressionError):
             return {}, {}
         forces, outputs = (
@@ -104,7 +104,7 @@ def _finite(v: np.ndarray) -> np.ndarray:
 
 def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:
     """Return the values of the effect's parameters at amplitudes s and a shape."""
-    known = {
+    values = {
         "s": s[0] if len(s) else 0.0,
         **{f"s{k + 1}": v for k, v in enumerate(s) if k},
         **shape,
@@ -115,7 +115,7 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
         if p.shape:
             out[p.name] = float(shape.get(p.shape, p.null))
         elif p.trial is not None:
-            value = float(ex.evaluate(p.trial, known))
+            value = float(ex.evaluate(p.trial, values))
             out[p.name] = value if np.isfinite(value) else p.null
         else:
             out[p.name] = p.null
@@ -146,8 +146,8 @@ def score(
     coefficient[useful] = inverse @ g[useful]
     shape, _ = columns[0].item[2]
     if c.effect.prior is not None:
-        told = [q for q, u in zip(columns, useful, strict=True) if u]
-        coefficient[useful] = _plausible(c, told, coefficient[useful], inverse)
+        useful_columns = [q for q, u in zip(columns, useful, strict=True) if u]
+        coefficient[useful] = _plausible(c, useful_columns, coefficient[useful], inverse)
     if len(g) == 1:
         coefficient[0] = _within(c, columns[0], float(coefficient[0]))
     gain = float(2 * g @ coefficient - coefficient @ m @ coefficient)
@@ -176,21 +176,21 @@ def _plausible(
     typical, prior = float(np.abs(dims.T @ coefficient)[1:].max(initial=0.0)), c.effect.prior
     if variance <= 0 or typical <= 0 or prior is None:
         return coefficient
-    known = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
+    recorded = {"first_air": c.rig.first_air(c.rig.drives[0]), "duration": c.rig.duration}
 
-    def at(log_size: float) -> np.ndarray:
+    def coefficients_at(log_size: float) -> np.ndarray:
         """Return the best coefficients (columns,) at a given log size of the first amplitude."""
         return np.asarray(coefficient + step * (np.exp(log_size) - size) / variance)
 
-    def surprise(log_size: float) -> float:
+    def cost(log_size: float) -> float:
         """Return -2 (log likelihood + log prior) at a log size of the first amplitude, up to a constant."""
-        sizes = dims.T @ at(log_size)
-        values = {**parameter_values(c, shape, list(sizes)), **known}
+        sizes = dims.T @ coefficients_at(log_size)
+        values = {**parameter_values(c, shape, list(sizes)), **recorded}
         unlikely = float(ex.evaluate(prior, values)) + 2 * (len(sizes) - 1) * log_size
         return float((np.exp(log_size) - size) ** 2 / variance + unlikely)
 
     reach = np.log(typical) + np.log(10.0) * np.array([-DECADES, DECADES])
-    return at(float(minimize_scalar(surprise, bounds=tuple(reach), method="bounded").x))
+    return coefficients_at(float(minimize_scalar(cost, bounds=tuple(reach), method="bounded").x))
 
 
 def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
@@ -215,9 +215,9 @@ def _within(c: Candidate, column: Column, coefficient: float) -> float:
         return coefficient
     shape, dim = column.item[2]
     low, high = c.bounds(p)
-    at = parameter_values(c, shape, [coefficient * v for v in dim])[p.name]
-    beyond = float(np.clip(at, low, high)) - p.null
-    return coefficient * beyond / (at - p.null) if beyond * (at - p.null) > 0 else coefficient
+    value = parameter_values(c, shape, [coefficient * v for v in dim])[p.name]
+    beyond = float(np.clip(value, low, high)) - p.null
+    return coefficient * beyond / (value - p.null) if beyond * (value - p.null) > 0 else coefficient
 
 
 def _sizes(
@@ -245,16 +245,16 @@ def _score_windows(
     """Keep the best pair of a start and an end. An end after the last column is the end of the recording."""
     edges = [q.item[2][0]["start"] for q in columns]
     last, floor = len(edges), 1e-12 * float(full.max()) ** 2
-    gain, at = -1.0, (0, 0, 0.0)
+    gain, window = -1.0, (0, 0, 0.0)
     for a in range(last):
         for b in range(a + 1, last + 1):
             top = g[a] - g[b] if b < last else g[a]
             bottom = m[a, a] + m[b, b] - 2 * m[a, b] if b < last else m[a, a]
             if bottom > floor and top * top / bottom > gain:
-                gain, at = top * top / bottom, (a, b, top / bottom)
+                gain, window = top * top / bottom, (a, b, top / bottom)
     if gain < 0:
         return
-    a, b, amplitude = at
+    a, b, amplitude = window
     # Heat that ends and a lack of heat that starts differ by a constant, which parameters absorb.
     # The lack is likelier.
     if a == 0 and b < last and m[b, b] > floor and g[b] ** 2 / m[b, b] > 0.8 * gain:
@@ -268,9 +268,9 @@ def _score_windows(
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:
     assert p.trial is not None  # an amplitude has one
-    at = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
+    value = float(ex.evaluate(p.trial, {"s": coefficient, "tau": 1.0, "first_air": 0.0}))
     return (
-        p.low - 1e-12 <= at <= p.high + 1e-12
+        p.low - 1e-12 <= value <= p.high + 1e-12
         or (p.low < p.null < p.high)
         or (coefficient > 0 if p.low >= p.null else coefficient < 0 if p.high <= p.null else True)
     )

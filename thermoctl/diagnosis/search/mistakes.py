@@ -53,8 +53,8 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
             return None
 
     tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
-    found = each(refitted, tried, LEAST * len(tried))
-    return [f for f in found if f is not None and not f.absent]
+    refits = each(refitted, tried, LEAST * len(tried))
+    return [f for f in refits if f is not None and not f.absent]
 
 
 def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:

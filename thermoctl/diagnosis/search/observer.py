@@ -75,8 +75,8 @@ def drifts(plant: Linear, duration: float) -> bool:
     """Return whether a mode of the plant drifts: it keeps the share KEPT of an error; False if unknown.
 
     A body that only cools slowly does not drift: it is linear enough for a free run."""
-    known = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
-    return known and bool(np.max(np.linalg.eigvals(plant.a).real) > np.log(KEPT) / duration)
+    finite = bool(len(plant.a)) and bool(np.isfinite(plant.a).all())  # the slope of a root may be infinite
+    return finite and bool(np.max(np.linalg.eigvals(plant.a).real) > np.log(KEPT) / duration)
 
 
 def held(plant: Plant, about: Linear, noise: Sequence[Noise], interval: float, trust: float) -> Plant | None:

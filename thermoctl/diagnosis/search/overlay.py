@@ -78,7 +78,7 @@ class Overlay:
         ]
 
     def changes(
-        self, values: Mapping[str, float], at: Trajectory
+        self, values: Mapping[str, float], trajectory: Trajectory
     ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return the changes (N,) along a trajectory: of slopes dx/dt by state, and of outputs by output.
 
@@ -86,26 +86,26 @@ class Overlay:
         base = self.base
         extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
         for n, net in self.new:
-            extra[n.name] = _new_node(n, net, extra, at)
+            extra[n.name] = _new_node(n, net, extra, trajectory)
         touched: dict[str, list[tuple[np.ndarray, float]]] = {}
         for f, old in self.flows:
-            delta = at.value(f.rate, extra) - (0.0 if old is None else at.own(old.rate))
+            delta = trajectory.value(f.rate, extra) - (0.0 if old is None else trajectory.own(old.rate))
             for end, sign in ((f.source, -1.0), (f.target, 1.0)):
                 if end in base.nodes:
                     touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
         slopes: dict[int, np.ndarray] = {}
         for node, terms in touched.items():
             total = sum(sign * delta for delta, sign in terms)
-            slopes[self.states.index(node)] = total / at.own(base.nodes[node].storage)
+            slopes[self.states.index(node)] = total / trajectory.own(base.nodes[node].storage)
         for n, storage in self.storages:
-            change = np.zeros(at.drive.t.shape)
+            change = np.zeros(trajectory.drive.t.shape)
             for f in base.flows.values():
                 if n.name in (f.source, f.target):
-                    change += (1.0 if f.target == n.name else -1.0) * at.own(f.rate)
-            slopes[self.states.index(n.name)] = change / at.value(storage, extra) - change / at.value(
-                n.storage, extra
-            )
-        return slopes, {j: at.value(new, extra) - at.own(old) for j, old, new in self.outputs}
+                    change += (1.0 if f.target == n.name else -1.0) * trajectory.own(f.rate)
+            slopes[self.states.index(n.name)] = change / trajectory.value(
+                storage, extra
+            ) - change / trajectory.value(n.storage, extra)
+        return slopes, {j: trajectory.value(new, extra) - trajectory.own(old) for j, old, new in self.outputs}
 
 
 def _net(plant: Plant, node: str) -> ex.Expr:
@@ -119,22 +119,28 @@ def _net(plant: Plant, node: str) -> ex.Expr:
     return net
 
 
-def _new_node(n: Node, net: ex.Expr, extra: Mapping[str, np.ndarray | float], at: Trajectory) -> np.ndarray:
+def _new_node(
+    n: Node, net: ex.Expr, extra: Mapping[str, np.ndarray | float], trajectory: Trajectory
+) -> np.ndarray:
     """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
     node = n.name
     first = {
-        **{k: float(np.asarray(v).flat[0]) for k, v in at.values.items()},
+        **{k: float(np.asarray(v).flat[0]) for k, v in trajectory.values.items()},
         **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()},
     }
-    start = float(ex.evaluate(n.initial, first, lambda key: at.first[key]))
-    t = at.drive.t
-    storage = at.value(n.storage, extra)
-    b = -at.value(ex.derivative(net, node), {**extra, node: start}) / storage
-    a = at.value(net, {**extra, node: 0.0}) / storage
+    start = float(ex.evaluate(n.initial, first, lambda key: trajectory.first[key]))
+    t = trajectory.drive.t
+    storage = trajectory.value(n.storage, extra)
+    b = -trajectory.value(ex.derivative(net, node), {**extra, node: start}) / storage
+    a = trajectory.value(net, {**extra, node: 0.0}) / storage
     if not a.any() and not b.any():
         return np.full(t.shape, start)
     h = np.diff(t)
-    before = at.value(net, {**extra, **at.until, node: 0.0}) / storage if ex.names(net) & set(at.until) else a
+    before = (
+        trajectory.value(net, {**extra, **trajectory.until, node: 0.0}) / storage
+        if ex.names(net) & set(trajectory.until)
+        else a
+    )
     mid_a, mid_b = 0.5 * (before[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
     decay = np.exp(-mid_b * h)
     gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a

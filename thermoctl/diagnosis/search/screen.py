@@ -40,22 +40,24 @@ Entry = tuple[Column, np.ndarray, float]  # a column, its rows after projection,
 
 
 def directions(
-    metric: Metric, at: Sequence[Trajectory], columns: Iterable[Column]
+    metric: Metric, trajectories: Sequence[Trajectory], columns: Iterable[Column]
 ) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
     """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
     left = iter(columns)
     while parts := [p for _ in range(ABREAST) if (p := list(itertools.islice(left, CHUNK)))]:
-        rows = each(lambda p: metric.responses(partial(_pushed, p, at), len(p)), parts, LEAST * len(parts))
+        rows = each(
+            lambda p: metric.responses(partial(_pushed, p, trajectories), len(p)), parts, LEAST * len(parts)
+        )
         yield from zip(parts, rows, strict=True)
 
 
-def _pushed(part: Sequence[Column], at: Sequence[Trajectory], r: int) -> Pushed:
+def _pushed(part: Sequence[Column], trajectories: Sequence[Trajectory], r: int) -> Pushed:
     """Return the first-order changes that the columns of a part cause in recording r."""
     forces: list[tuple[int, int]] = []
     values: list[np.ndarray] = []
     changed: dict[tuple[int, int], np.ndarray] = {}
     for c, column in enumerate(part):
-        pushed, read = column.changes(at[r])
+        pushed, read = column.changes(trajectories[r])
         forces += [(state, c) for state in pushed]
         values += pushed.values()
         changed |= {(j, c): delta for j, delta in read.items()}
@@ -77,9 +79,9 @@ Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list[
 def screen(
     metrics: Sequence[Metric],
     rig: Rig,
-    found: Sequence[Candidate],
+    placed: Sequence[Candidate],
     edges: np.ndarray | None = None,
-    select: Select = lambda metrics, at, groups: groups,
+    select: Select = lambda metrics, trajectories, groups: groups,
     norms: list[Norms] | None = None,
 ) -> list[list[Direction]]:
     """Return every candidate's best direction, best first, in each of the metrics.
@@ -88,14 +90,14 @@ def screen(
     If there are more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). If all
     columns are simulated, their norms in the first metric are appended to `norms`."""
     first = metrics[0]
-    at = [Trajectory(first, rig, r) for r in range(len(first.drives))]
-    groups = [g for c in found for g in groups_of(c, first, edges)]
+    trajectories = [Trajectory(first, rig, r) for r in range(len(first.drives))]
+    groups = [g for c in placed for g in groups_of(c, first, edges)]
     if sum(len(g.sizes) for g in groups) > EXACT:
-        groups, norms = select(metrics, at, groups), None
+        groups, norms = select(metrics, trajectories, groups), None
     best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[Entry]] = {}
     columns = (column for g in groups for column in g.columns())
-    for part, plain in directions(first, at, columns):
+    for part, plain in directions(first, trajectories, columns):
         for metric, leaders in zip(metrics, best, strict=True):
             rows = plain * metric.weight[:, None]
             full = np.linalg.norm(rows, axis=0)
@@ -114,29 +116,31 @@ def screen(
     return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
 
 
-def sharpened(metric: Metric, rig: Rig, found: Direction) -> Direction:
+def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
     """Return the direction with its onset (or start and end) refined to the sample.
 
     A refit cannot move them: a jump has no derivative by its time. Each grid is four times finer than the
     one before."""
-    kinds = found.candidate.effect.shapes.values()
+    kinds = direction.candidate.effect.shapes.values()
     if "onsets" not in kinds and "windows" not in kinds:
-        return found
+        return direction
     duration = max(float(d.t[-1]) for d in metric.drives)
     step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
     while step > 0.5 * sample:
         near = np.concatenate(
             [
-                found.shape[k] + step * np.arange(-4, 5) / 4
+                direction.shape[k] + step * np.arange(-4, 5) / 4
                 for k in ("onset", "start", "end")
-                if found.shape.get(k, np.inf) <= duration
+                if direction.shape.get(k, np.inf) <= duration
             ]
         )
-        (better,) = screen([metric], rig, [found.candidate], np.unique(near[(near >= 0) & (near < duration)]))
-        if better and better[0].gain > found.gain:
-            found = better[0]
+        (better,) = screen(
+            [metric], rig, [direction.candidate], np.unique(near[(near >= 0) & (near < duration)])
+        )
+        if better and better[0].gain > direction.gain:
+            direction = better[0]
         step /= 4
-    return found
+    return direction
 
 
 @dataclass(frozen=True)

@@ -47,11 +47,11 @@ class Plain:
         ]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
         self.point = self.fit.values, self.fit.dx0
-        found = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
-        self.runs = [run for run, _, _ in found]
-        self.residual = np.concatenate([residual for _, residual, _ in found])
+        parts = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
+        self.runs = [run for run, _, _ in parts]
+        self.residual = np.concatenate([residual for _, residual, _ in parts])
         # By recording (rows, k), with respect to `unknowns`.
-        self.sensitivities = [rows for *_, rows in found]
+        self.sensitivities = [rows for *_, rows in parts]
 
     def unknowns(self, r: int) -> np.ndarray:
         """Return the unknowns of recording r."""
@@ -153,12 +153,12 @@ class Rows(Metric):
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
         """Apply the transpose of `unweighted` to rows w (rows, k): return (N, outputs, k) of recording r."""
-        d, at = self.drives[r], 0
+        d, begin = self.drives[r], 0
         out = np.zeros((*d.y.shape, w.shape[1]))
         for c in self.plain.coordinates.channels:
             if c.recording == r:
-                out[:, c.output] += self.plain.coordinates.transposed(c, w[at : at + c.rows], len(d.t))
-            at += c.rows
+                out[:, c.output] += self.plain.coordinates.transposed(c, w[begin : begin + c.rows], len(d.t))
+            begin += c.rows
         return out
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
@@ -203,10 +203,10 @@ def _weights(case: Case, average: Averaged, coordinates: Coordinates, remainder:
     if not remainder:
         own = {k: v for g, v in zip(case.grids, average.sensor, strict=True) for k in g.channels}
         inverse = [np.full_like(v, 1 / own[k]) for k, v in enumerate(inverse)]
-    known = {(c.recording, c.output): k for k, c in enumerate(case.coordinates.channels)}
+    positions = {(c.recording, c.output): k for k, c in enumerate(case.coordinates.channels)}
     out = []
     for c in coordinates.channels:
-        k = known[c.recording, c.output]
+        k = positions[c.recording, c.output]
         v = np.interp(np.log(c.frequency), np.log(case.coordinates.channels[k].frequency), np.log(inverse[k]))
         out.append(np.exp(0.5 * v)[c.band])
     return out
@@ -242,23 +242,23 @@ def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
     )
-    found = [
+    placed = [
         c
         for c in candidates(rig, case.catalogue)
         if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
     ]
     norms: list[Norms] = []
     metrics = [metric, other] if other else [metric]
-    best, *rest = screen(metrics, rig, found, select=likeliest, norms=norms)
+    best, *rest = screen(metrics, rig, placed, select=likeliest, norms=norms)
     promised = [(d, metric.promise(d)) for d in foremost(best, ROOM * PLACES_EACH)[:PROMISED]]
     by_energy = rest[0] if rest else []
     if other:
         again = [(d, other.promise(d)) for d in foremost(by_energy, ROOM * PLACES_EACH)[:PROMISED]]
-        known = {d.candidate.key: promise for d, promise in promised}
+        by_key = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [
             (dataclasses.replace(d, vector=None), p)  # its vector is of another metric
             for d, p in again
-            if p > known.get(d.candidate.key, 0.0)
+            if p > by_key.get(d.candidate.key, 0.0)
         ]
     promised.sort(key=lambda x: -x[1])
     return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy, norms)

@@ -62,18 +62,18 @@ def shortlist(
 
     First are those with the largest predicted gain, the best first. Then come those with the largest gain in
     energy, then pairs, both with an infinite gain. Each list has at most PLACES_EACH places of one effect."""
-    paying = []
+    worthwhile = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = promise + odds((Placed(d.candidate, {}),), where, limits)
         if gain > 0 and d.gain > 0 and not relabels(d.candidate):
-            paying.append((d, gain))
-    paying.sort(key=lambda x: -x[1])
-    gains = {d.candidate.key: gain for d, gain in reversed(paying)}
-    best = foremost(once(d for d, _ in paying), PLACES_EACH)[: limits.shortlist]
-    out = [((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > paying[0][1]]
-    known = {d.candidate.key for (d,), _ in out}
-    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in known]
-    together = pairs([d for d, _ in paying], looked.metric, limits)
+            worthwhile.append((d, gain))
+    worthwhile.sort(key=lambda x: -x[1])
+    gains = {d.candidate.key: gain for d, gain in reversed(worthwhile)}
+    best = foremost(once(d for d, _ in worthwhile), PLACES_EACH)[: limits.shortlist]
+    out = [((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > worthwhile[0][1]]
+    listed = {d.candidate.key for (d,), _ in out}
+    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in listed]
+    together = pairs([d for d, _ in worthwhile], looked.metric, limits)
     if looked.energy:
         together += pairs(looked.by_energy, looked.energy, limits)
     return [*out, *((p, np.inf) for p in together)]

@@ -36,7 +36,9 @@ SAMPLES = 4_000  # largest number of samples of an adjoint run; forces are summe
 GAMMA = 1 - float(np.sqrt(0.5))  # coefficient of the integration: two implicit stages, order 2, L-stable
 
 
-def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[Group]) -> list[Group]:
+def likeliest(
+    metrics: Sequence[Metric], trajectories: Sequence[Trajectory], groups: list[Group]
+) -> list[Group]:
     """Return the best group of each of the likeliest candidates, up to KEPT columns for each metric.
 
     All groups are returned if the plant has a delay or an FMU: it then has no adjoint of this form."""
@@ -46,19 +48,19 @@ def likeliest(metrics: Sequence[Metric], at: Sequence[Trajectory], groups: list[
     columns = [column for g in groups for column in g.columns()]
     edges = np.cumsum([len(g.sizes) for g in groups])[:-1]
     keep: set[int] = set()
-    for found in products(metrics, at, columns):
-        parts = np.split(found, edges)
+    for product in products(metrics, trajectories, columns):
+        parts = np.split(product, edges)
         keep |= _best(groups, [_scored(list(g.columns()), x) for g, x in zip(groups, parts, strict=True)])
     return [groups[i] for i in sorted(keep)]
 
 
 def products(
-    metrics: Sequence[Metric], at: Sequence[Trajectory], columns: Sequence[Column]
+    metrics: Sequence[Metric], trajectories: Sequence[Trajectory], columns: Sequence[Column]
 ) -> list[np.ndarray]:
     """Return the columns' products with residual and sketches (columns, 1 + SKETCHES), by metric."""
     vectors = [_vectors(metric) for metric in metrics]
     out = np.zeros((len(columns), len(metrics) * (1 + SKETCHES)))
-    for r, trajectory in enumerate(at):
+    for r, trajectory in enumerate(trajectories):
         pull = np.concatenate([m.spread(r, v) for m, v in zip(metrics, vectors, strict=True)], axis=2)
         forces, starts = _adjoint(metrics[0], trajectory, pull)
         for k, column in enumerate(columns):
@@ -84,10 +86,10 @@ def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None
     return next((d for d in best.values() if d.gain > 0), None)
 
 
-def _best(groups: Sequence[Group], found: Sequence[Direction | None]) -> set[int]:
+def _best(groups: Sequence[Group], directions: Sequence[Direction | None]) -> set[int]:
     """Return the positions of the best group of each of the best candidates, up to KEPT columns."""
     best: dict[int, tuple[float, int]] = {}
-    for i, (g, d) in enumerate(zip(groups, found, strict=True)):
+    for i, (g, d) in enumerate(zip(groups, directions, strict=True)):
         if d is not None:
             best[id(g.candidate)] = min(best.get(id(g.candidate), (np.inf, i)), (d.log_p, i))
     order = [i for _, i in sorted(best.values())]
@@ -95,7 +97,7 @@ def _best(groups: Sequence[Group], found: Sequence[Direction | None]) -> set[int
     return set(order[:until])
 
 
-def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _adjoint(metric: Metric, trajectory: Trajectory, pull: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return l (states, samples, k) for `pull` (N, outputs, k), and the first row of each sample.
 
     l is averaged over the rows of a sample. The method is the transpose of two implicit stages over each
@@ -103,13 +105,13 @@ def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarr
 
         M k1 = J x + q(GAMMA),   M k2 = J (x + (1 - GAMMA) h k1) + q(1),   M = 1 - GAMMA h J
         x' = x + h ((1 - GAMMA) k1 + GAMMA k2)"""
-    model, t = metric.model, at.drive.t
+    model, t = metric.model, trajectory.drive.t
     nx, n, k = len(model.states), len(t), pull.shape[2]
     starts = np.arange(0, n, -(-n // SAMPLES))
     sample = np.searchsorted(starts, np.arange(n), side="right") - 1
-    slopes = _Entries(at, model.code.jacobian())
+    slopes = _Entries(trajectory, model.code.jacobian())
     seen = _Entries(
-        at,
+        trajectory,
         [
             (j, i, d)
             for j, o in enumerate(model.plant.outputs.values())
@@ -118,15 +120,15 @@ def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarr
         ],
     )
     out = np.zeros((nx, len(starts), k), np.float32)
-    x, known = np.zeros((nx, k)), None
+    x, factored = np.zeros((nx, k)), None
     for m in range(n - 1, -1, -1):
         own = np.zeros((nx, k))
         if m < n - 1:
             h = float(t[m + 1] - t[m])
             middle = 0.5 * (slopes.values[:, m] + slopes.values[:, m + 1])
-            if known is None or h != known[0] or not np.array_equal(middle, known[1]):
-                known = h, middle, splu(slopes.without(GAMMA * h * middle, nx))
-            solve = known[2].solve
+            if factored is None or h != factored[0] or not np.array_equal(middle, factored[1]):
+                factored = h, middle, splu(slopes.without(GAMMA * h * middle, nx))
+            solve = factored[2].solve
             k2 = solve(GAMMA * h * x, "T")
             pulled = k2 / (GAMMA * h) - x  # J' k2
             right = (1 - GAMMA) * h * (x + pulled)
@@ -142,9 +144,11 @@ def _adjoint(metric: Metric, at: Trajectory, pull: np.ndarray) -> tuple[np.ndarr
 class _Entries:
     """Entries (row, column, expression) of a matrix, and their values (entries, N) along a trajectory."""
 
-    def __init__(self, at: Trajectory, entries: Sequence[tuple[int, int, ex.Expr]]):
+    def __init__(self, trajectory: Trajectory, entries: Sequence[tuple[int, int, ex.Expr]]):
         self.place = [i for i, *_ in entries], [j for _, j, _ in entries]
-        self.values = np.array([at.value(e, {}) for *_, e in entries]).reshape(len(entries), len(at.drive.t))
+        self.values = np.array([trajectory.value(e, {}) for *_, e in entries]).reshape(
+            len(entries), len(trajectory.drive.t)
+        )
 
     def without(self, values: np.ndarray, size: int) -> csc_matrix:
         """Return the identity less the matrix of these values."""

@@ -69,12 +69,12 @@ class Blocks:
                 raise SimulationError("the simulation gives values that are not numbers")
             x[~good] = 0.0
             draws += [_draws(x[good[:, j], j, -1]) for j in range(outputs)]
-            at = np.ix_([*unknowns, k], [*unknowns, k])
+            entries = np.ix_([*unknowns, k], [*unknowns, k])
             for b, (own, seen) in enumerate(
                 zip(np.array_split(x, BLOCKS), np.array_split(good, BLOCKS), strict=True)
             ):
                 for j in range(outputs):
-                    self.sums[r, b, j][at] = own[:, j].T @ own[:, j]
+                    self.sums[r, b, j][entries] = own[:, j].T @ own[:, j]
                 self.count[r, b] = seen.sum(axis=0)
         self.recording = np.array([-1 if r is None else r for _, r in problem.unknowns])
         self.low, self.high = (np.array(bound) for bound in log.bounds)
@@ -126,7 +126,7 @@ class Blocks:
 
     @cached_property
     def predicted(self) -> np.ndarray:
-        """Mean squares over the noise (recordings, BLOCKS, outputs) of each part, predicted from the others.
+        """Mean squares over the noise (recordings, BLOCKS, outputs) of each part, fitted to the other parts.
 
         NaN where an output was not measured."""
         whole, rows = self.sums.sum(axis=(0, 1)), np.maximum(self.count.sum(axis=(0, 1)), 1.0)
@@ -185,10 +185,10 @@ class Confirm:
         """Return ln(E + FLOOR) (parts, outputs); None where a simulation fails."""
         if keys not in self._known:
             try:
-                found = self._aside(keys) if self.reserve else self._left_out(keys)
+                energy = self._aside(keys) if self.reserve else self._left_out(keys)
             except (SimulationError, np.linalg.LinAlgError):
-                found = None
-            self._known[keys] = None if found is None else np.log(found + FLOOR)
+                energy = None
+            self._known[keys] = None if energy is None else np.log(energy + FLOOR)
         return self._known[keys]
 
     def _left_out(self, keys: Keys) -> np.ndarray | None:
@@ -203,16 +203,16 @@ class Confirm:
     def _aside(self, keys: Keys) -> np.ndarray | None:
         """Return the mean squares in the parts of the recordings set aside."""
         sigma = np.array([n.sigma for n in self.case.noise])
-        found = []
+        squares = []
         for table in self.reserve:
             error = errors_aside(self.case, self.tried[keys].plant, table) / sigma
             for part in np.array_split(error, BLOCKS):
                 seen = np.isfinite(part)
                 square = np.where(seen, part, 0.0) ** 2
-                found.append(
+                squares.append(
                     np.where(seen.any(axis=0), square.sum(axis=0) / np.maximum(seen.sum(axis=0), 1), np.nan)
                 )
-        out = np.array(found)
+        out = np.array(squares)
         return out if np.isfinite(out).any() else None
 
 

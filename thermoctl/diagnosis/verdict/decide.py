@@ -128,10 +128,12 @@ def alternatives(
     posterior: Probabilities, named: Sequence[Key], limits: Thresholds
 ) -> tuple[tuple[Key, float], ...]:
     """Return the other effects of the likeliest hypotheses that together reach probability `limits.set`."""
-    total, found = 0.0, set[Key]()
+    total, effects = 0.0, set[Key]()
     for keys, p in sorted(posterior.hypotheses.items(), key=lambda item: (-item[1], sorted(item[0]))):
         if total >= limits.set:
             break
         total += p
-        found |= keys
-    return tuple(sorted(((k, posterior.effects[k]) for k in found - set(named)), key=lambda x: (-x[1], x[0])))
+        effects |= keys
+    return tuple(
+        sorted(((k, posterior.effects[k]) for k in effects - set(named)), key=lambda x: (-x[1], x[0]))
+    )

@@ -40,7 +40,7 @@ def families(
         (k for k, p in posterior.effects.items() if p >= MEMBER), key=lambda k: (-posterior.effects[k], k)
     )
     open_ = [k for k in likely if k not in named]
-    found: list[Family] = []
+    certain: list[Family] = []
     while open_:
         members = tuple(k for k in open_ if k == open_[0] or related(k, open_[0], entries))
         open_ = [k for k in open_ if k not in members]
@@ -52,8 +52,8 @@ def families(
         )
         p = min(p, max((asked[k] for k in members if k in asked), default=1.0))
         if p >= name:
-            found.append(Family(members, p))
-    return tuple(found)
+            certain.append(Family(members, p))
+    return tuple(certain)
 
 
 def related(a: Key, b: Key, entries: Mapping[str, Effect]) -> bool:

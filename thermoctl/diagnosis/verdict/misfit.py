@@ -54,12 +54,12 @@ def standing(
     """Return the probability that each effect of a hypothesis is physics, by hypothesis.
 
     Hypotheses with effects are left out if no effect of theirs stands out of the misfit. An effect is
-    compared with the best tried hypothesis that holds no effect but some of the others. Effects that do not
+    compared with the best tried hypothesis whose effects are a subset of the others. Effects that do not
     stand out are part of the misfit. The others then have the larger of their probabilities beside them and
     without them. A hypothesis is left out, too, if an effect in it does not stand out against the simpler
     entry that it contains. `dims`: number of parameters of each effect; `contains`: by entry, the simpler
     one."""
-    found: dict[frozenset[Key], dict[Key, float]] = {}
+    probabilities: dict[frozenset[Key], dict[Key, float]] = {}
     simpler = set()
     for home in sorted(energy, key=len):
         mine, own = energy[home], {}
@@ -71,10 +71,10 @@ def standing(
         if stand in simpler or any(_is_simpler(home, key, energy, dims, contains, limits) for key in home):
             simpler.add(home)
             continue
-        for key, p in found.get(stand, {}).items() if stand < home else ():
+        for key, p in probabilities.get(stand, {}).items() if stand < home else ():
             own[key] = max(own[key], p)
-        found[home] = own
-    return {home: own for home, own in found.items() if not home or standouts(own)}
+        probabilities[home] = own
+    return {home: own for home, own in probabilities.items() if not home or standouts(own)}
 
 
 def _is_simpler(
@@ -101,19 +101,19 @@ def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
 
 
 def supported(
-    likeliest: frozenset[Key], found: Mapping[frozenset[Key], Mapping[Key, float]]
+    likeliest: frozenset[Key], probabilities: Mapping[frozenset[Key], Mapping[Key, float]]
 ) -> frozenset[Key]:
     """Return the effects of a hypothesis without those that are more probably a misfit.
 
     The weakest is left out first. Of two effects of the same shape, neither stands out beside the other. The
-    stronger one stands out once the weaker one is left out. `found`: the result of `standing`."""
+    stronger one stands out once the weaker one is left out. `probabilities`: the result of `standing`."""
     keys = likeliest
-    while own := found.get(keys, {}):
+    while own := probabilities.get(keys, {}):
         weakest = min(own, key=lambda key: own[key])
         if own[weakest] > MISFIT:
             return keys
         keys = keys - {weakest}
-    return standouts(found[likeliest])
+    return standouts(probabilities[likeliest])
 
 
 def physics(without: Energy, beside: Energy, share: float) -> float:
@@ -121,9 +121,9 @@ def physics(without: Energy, beside: Energy, share: float) -> float:
     if not any(beside.misfit):
         return 1.0
     removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
-    known = max(float(removed[left > 0].sum()), 0.0) / (share * float(left.sum()))
-    known += float(removed[left == 0] @ np.array(beside.rows)[left == 0])
-    square = float(np.clip(known, 0.0, SURE))
+    evidence = max(float(removed[left > 0].sum()), 0.0) / (share * float(left.sum()))
+    evidence += float(removed[left == 0] @ np.array(beside.rows)[left == 0])
+    square = float(np.clip(evidence, 0.0, SURE))
     r = max(np.sqrt(square), 1.0)
     odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
     return float(odds / (1 + odds))
@@ -150,12 +150,12 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
     """Return the energies of a refit.
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
-    found = []
+    parts = []
     for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
         output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
         rows = float(g.count.sum()) + f.past.counts.get(output, 0.0)
         square = power / (rows * own)
         noisy = 1.0 if p >= limits.name and not coarse else limits.clean**2
-        found.append((square, max(square - noisy, 0.0), rows))
-    return Energy(*zip(*found, strict=True))
+        parts.append((square, max(square - noisy, 0.0), rows))
+    return Energy(*zip(*parts, strict=True))

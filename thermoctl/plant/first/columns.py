@@ -1,7 +1,7 @@
 """Recognise the columns of a recording: by unit, else by name in several languages and by values.
 
 A unit is certain. A name is a guess, which the plant file marks `# confirm`. A column without a unit is never
-taken as a power. Where its name means one, a parameter says how many watts one of its units is.
+taken as a power. If its name means a power, a parameter states how many watts one of its units is.
 """
 
 from __future__ import annotations

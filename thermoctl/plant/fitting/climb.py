@@ -54,7 +54,7 @@ class Hill(Protocol[T]):
         """Is one evaluation with slopes cheaper than one without, followed by one with them?"""
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[T]:
-        """Return the height at z; with `slopes` they are computed, too."""
+        """Return the height at z; with `slopes` the derivatives by z are computed, too."""
 
     def stand(self, spot: Spot[T]) -> tuple[np.ndarray, np.ndarray]:
         """Return gradient (n,) and H (n, n) at a spot. Its slopes stay until the next call."""

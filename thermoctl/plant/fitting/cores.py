@@ -17,8 +17,8 @@ from typing import Any, Protocol, TypeVar
 LEAST = (
     200_000  # numbers that a run computes, about a millisecond: less is not worth the way to another thread
 )
-# Refits, or chunks of directions, that run side by side. A refit ends early if it falls behind those before:
-# with a number that follows the cores the result would follow them, too.
+# Number of refits, or of chunks of directions, that run in parallel. The result depends on it, because a
+# refit ends early if it falls behind earlier ones. So it does not follow the number of cores.
 ABREAST = 2
 
 T = TypeVar("T")

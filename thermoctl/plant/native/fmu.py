@@ -171,7 +171,7 @@ class Fmu:
         return out.reshape(shaped[0].shape)[()]
 
     def _rows(self, names: Sequence[str], values: Sequence[np.ndarray], missing: float) -> np.ndarray:
-        """Return rows of all arguments (N, 1 + arguments) from the values (N,) of time and of some."""
+        """Return rows of all arguments (N, 1 + arguments) from the values (N,) of some, such as time."""
         rows = np.full((values[0].size, 1 + len(self.arguments)), missing)
         for name, value in zip((None, *names), values, strict=True):
             rows[:, 0 if name is None else self.argument(name)] = value.ravel()

@@ -480,7 +480,7 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
             continue
         size = float(match[1].replace(",", "."))
         if not _INTERVAL.search(key) and spelled(match[2]) not in SECONDS:
-            continue  # `Samples 600` is their number, `Sampling 1s` an interval
+            continue  # `Samples 600` states the number of samples, `Sampling 1s` their interval
         stated = (
             match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
         )
