@@ -22,7 +22,7 @@ from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
-PLANT = Path(shipped.__file__).parents[1] / "config" / "plants" / "actuator_thermal.yaml"
+PLANT = shipped.shipped("config") / "plants" / "actuator_thermal.yaml"
 
 
 def test_a_refit_is_reported_of_those_planned():
