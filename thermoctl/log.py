@@ -60,18 +60,18 @@ def take_over() -> None:
 
 
 def _add_bound(_: Any, __: str, fields: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
-    found = {name: value for name, value in fields.items() if value is not None}
-    last = {**_bound, **found}
-    return {k: v for k, v in found.items() if k not in _LAST} | {k: last[k] for k in _LAST if k in last}
+    given = {name: value for name, value in fields.items() if value is not None}
+    last = {**_bound, **given}
+    return {k: v for k, v in given.items() if k not in _LAST} | {k: last[k] for k in _LAST if k in last}
 
 
 def _to_journal() -> bool:
     """Return whether systemd connected stderr with journald (JOURNAL_STREAM of systemd.exec(5))."""
     try:
-        found = os.fstat(2)
+        status = os.fstat(2)
     except OSError:
         return False
-    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 def _render(_: Any, __: str, fields: MutableMapping[str, Any]) -> str:

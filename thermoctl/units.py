@@ -188,14 +188,16 @@ def _symbol(symbol: str) -> Dimension:
         return tuple(sorted((base, Fraction(int(power or 1))) for base, power in pairs))
     lookup, undefined = _pint()
     try:
-        found = lookup(symbol.replace("°C", "degC").replace("°", "deg"))
+        symbol_ = lookup(symbol.replace("°C", "degC").replace("°", "deg"))
     except undefined:
         raise ValueError(f"pint knows no unit '{symbol}'") from None
-    if not set(found) <= set(_BASES):
+    if not set(symbol_) <= set(_BASES):
         raise ValueError(f"'{symbol}' is no unit of physics that a plant may use")
     return tuple(
         sorted(
-            (_BASES[key], Fraction(power).limit_denominator(10_000)) for key, power in found.items() if power
+            (_BASES[key], Fraction(power).limit_denominator(10_000))
+            for key, power in symbol_.items()
+            if power
         )
     )
 

@@ -68,14 +68,14 @@ def _try(root: Node, c: Candidate, label: str) -> None:
     try:
         check_units(dataclasses.replace(c.extend(values), file=label))
     except (InputError, expression.ExpressionError, KeyError) as e:
-        told = re.sub(r"^.*?:\d+:\d+: ", "", str(e))
-        raise change.error(f"at {label}: {told}") from None
+        message = re.sub(r"^.*?:\d+:\d+: ", "", str(e))
+        raise change.error(f"at {label}: {message}") from None
 
 
 def files_of(paths: Sequence[str]) -> Iterator[Path]:
     """Yield the effect files of files and folders. Raises InputError for a folder without one."""
     for path in map(Path, paths or [str(CATALOGUE)]):
-        found = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
-        if not found:
+        files = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
+        if not files:
             raise InputError(f"{path}: no effect files (*.yaml) here")
-        yield from found
+        yield from files

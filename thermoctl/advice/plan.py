@@ -112,8 +112,8 @@ def plan(
 
 def _at_rest(plant: Plant, effects: Mapping[str, Effect], seen: set[Key]) -> list[Visible]:
     """Return the effects that have a place in the plant only while other inputs move."""
-    found = {c.key: c for c in candidates(made_rig(plant), effects) if sized(c.effect) and c.key not in seen}
-    return [Visible(c, "", None, np.inf, NOT_EXCITED) for c in found.values()]
+    placed = {c.key: c for c in candidates(made_rig(plant), effects) if sized(c.effect) and c.key not in seen}
+    return [Visible(c, "", None, np.inf, NOT_EXCITED) for c in placed.values()]
 
 
 def _course(model: Model, limits: Ranges) -> Table:
@@ -175,14 +175,14 @@ def parameters(model: Model, tables: Sequence[Table]) -> list[Parameter]:
     covariance = _covariance(problem, ALONE)
     alone = np.sqrt(np.diag(covariance))
     correlation = np.abs(covariance / np.outer(alone, alone)) - np.eye(len(alone))
-    found = {}
+    fitted_sizes = {}
     for k, (name, _) in enumerate(problem.unknowns[: problem.n_parameters]):
         p = model.plant.parameters[name]
         known = bool(alone[k] ** 2 * UNIFORM < 1)
         other = problem.unknowns[int(np.argmax(correlation[k]))][0] if len(sd) > 1 else None
         size = float(sd[k] * problem.scales[name].slope(p.value))
-        found[name] = Parameter(name, p.value, p.unit, size, known, None if known else other)
-    return list(found.values())
+        fitted_sizes[name] = Parameter(name, p.value, p.unit, size, known, None if known else other)
+    return list(fitted_sizes.values())
 
 
 def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Ranges) -> Course | None:
@@ -190,15 +190,15 @@ def better(plant: Plant, model: Model, tables: Sequence[Table], limits: Ranges) 
 
     It is one of the candidates of diagnosis/experiment/design.py, as long as one recording. The determinant
     of the parameters' covariance decides; of several recordings, that of an average one."""
-    found = levers(plant, tables, tuple(limits), limits)
-    if not found or not model.active:
+    driven = levers(plant, tables, tuple(limits), limits)
+    if not driven or not model.active:
         return None
     problem = _problem(model, tables)
     now = _information(problem) - problem.n_parameters * float(np.log(len(tables)))
     length = float(np.median([t.t[-1] - t.t[0] for t in tables]))
     step = float(np.median(np.diff(tables[0].t)))
     best: tuple[float, Excitation, Problem] | None = None
-    tried = [e for e in family(plant, tables, found, max(step, length / ROWS)) if e.duration_s <= length]
+    tried = [e for e in family(plant, tables, driven, max(step, length / ROWS)) if e.duration_s <= length]
     for e in tried:
         try:
             problem = _problem(model, [model.measure(e.table(plant, max(step, e.duration_s / ROWS)))])

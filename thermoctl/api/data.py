@@ -44,8 +44,8 @@ def tables_of(
 
     `how`: see `logger.How`; of files only. Raises InputError."""
     items: Sequence[Any] = data if isinstance(data, list | tuple) else [data]
-    found = [_table(item, f"data_{k + 1}", time, columns, how) for k, item in enumerate(items)]
-    return [part for table in found for part in _parts(plant, table)] if plant else found
+    read_tables = [_table(item, f"data_{k + 1}", time, columns, how) for k, item in enumerate(items)]
+    return [part for table in read_tables for part in _parts(plant, table)] if plant else read_tables
 
 
 def _parts(plant: Plant, table: Table) -> list[Table]:

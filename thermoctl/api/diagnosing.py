@@ -133,7 +133,7 @@ def diagnose(
         raise InputError(f"{severe[0]} (anyway=True diagnoses in spite of it)")
     entries = catalogue((CATALOGUE, *map(Path, effects)))
     reserve = tables_of(own.description, held_out)
-    found = _diagnose(own.description, tables, entries, limits(), reserve)
-    if not anyway and (wrong := relabelled(found, split(tables, reserve)[0], limits())):
+    outcome = _diagnose(own.description, tables, entries, limits(), reserve)
+    if not anyway and (wrong := relabelled(outcome, split(tables, reserve)[0], limits())):
         raise InputError(f"{wrong[0]} (anyway=True diagnoses in spite of it)")
-    return Diagnosis(own, found)
+    return Diagnosis(own, outcome)

@@ -38,8 +38,8 @@ class Refit:
         """Value, standard error, state and trade-offs of each fitted parameter, by name.
 
         One of a recording of its own is called `NAME (RECORDING)`."""
-        found = report(self.fit, self.excitations)
-        return {f"{e.name} ({e.recording})" if e.recording else e.name: e for e in found}
+        estimates = report(self.fit, self.excitations)
+        return {f"{e.name} ({e.recording})" if e.recording else e.name: e for e in estimates}
 
     @property
     def rms(self) -> dict[str, float]:
@@ -64,15 +64,15 @@ class Refit:
 
         The other parameters are fitted anew at each. A rise of 3.84 bounds the 95 % interval. `reach`: half
         the width in standard errors. Raises InputError for a parameter that was not fitted."""
-        found = self.parameters.get(parameter)
-        limits = self.before.description.parameters[parameter].range if found else None
-        if found is None or limits is None:
+        estimate = self.parameters.get(parameter)
+        limits = self.before.description.parameters[parameter].range if estimate else None
+        if estimate is None or limits is None:
             names = list(self.parameters)
             raise InputError(
                 f"'{parameter}' was not fitted{suggest(parameter, names)}; {', '.join(names)} were"
             )
-        sd = found.sd if np.isfinite(found.sd) else limits[1] - limits[0]
-        low, high = max(found.value - reach * sd, limits[0]), min(found.value + reach * sd, limits[1])
+        sd = estimate.sd if np.isfinite(estimate.sd) else limits[1] - limits[0]
+        low, high = max(estimate.value - reach * sd, limits[0]), min(estimate.value + reach * sd, limits[1])
         others = tuple(q for q in self.fit.model.active if q != parameter)
         values, rise = np.linspace(low, high, points), np.empty(points)
         start = self.fit.parameters()

@@ -140,9 +140,9 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
     one = schedules.triangles(settings, rig.now()["compensated_um"])
     if not drive.agreed(rig, [one] * (TESTS if write else 1), yes):
         return 1
-    found = tune_loop(rig, method, write, Keyboard(False), lambda line: print(line, flush=True))
-    if write and found.proposed != found.present:
-        tuning.write(Path(settings.path), found.proposed, settings.axis)
+    tuned = tune_loop(rig, method, write, Keyboard(False), lambda line: print(line, flush=True))
+    if write and tuned.proposed != tuned.present:
+        tuning.write(Path(settings.path), tuned.proposed, settings.axis)
         print(f"written to {settings.path}; 'thermoctl reload' applies it")
     return 0
 

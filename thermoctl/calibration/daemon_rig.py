@@ -224,14 +224,14 @@ def command_period_s(settings: Settings) -> float:
     A tick sends the command when 1 / command_hz has passed since the last one; a slow device takes it in the
     rounds of its poller. A CiA-402 drive takes it in every tick."""
     period_s = settings.loop.period_s
-    found = [period_s]
+    periods_s = [period_s]
     for device in driving_devices(settings) if settings.hal.backend == "devices" else ():
         amplifier = device.binding.profile.amplifier
         if amplifier is None or amplifier.command is None:
             continue
         ticks = 1.0 / (amplifier.command_hz * period_s)
-        found.append((ticks + 1.0 if device.slow else math.ceil(ticks - 1e-9)) * period_s)
-    return max(found)
+        periods_s.append((ticks + 1.0 if device.slow else math.ceil(ticks - 1e-9)) * period_s)
+    return max(periods_s)
 
 
 @contextlib.contextmanager

@@ -32,10 +32,10 @@ def lists_inputs(name: str) -> bool:
 
 def of_inputs(path: str) -> experiments.Inputs:
     """Read the one experiment of a file that lists inputs."""
-    found = list(experiments.load_inputs(path).values())
-    if len(found) != 1:
-        raise InputError(f"{path}: {len(found)} experiments that list inputs; one was expected")
-    return found[0]
+    listed = list(experiments.load_inputs(path).values())
+    if len(listed) != 1:
+        raise InputError(f"{path}: {len(listed)} experiments that list inputs; one was expected")
+    return listed[0]
 
 
 def on_plant(inputs: experiments.Inputs, plant_file: str | None, path: Path) -> int:

@@ -100,5 +100,5 @@ def causes(row: np.ndarray) -> str:
 
     Without any fault, a user disarmed the rig.
     """
-    found = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
-    return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in found) or "somebody disarmed it"
+    tripping = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
+    return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in tripping) or "somebody disarmed it"

@@ -126,14 +126,14 @@ def doctor(states: Mapping[str, str], settings: Settings) -> Doctor:
 
     Raises InputError with the invalid ones."""
     needed = [n for n in NEEDED if n != "voltage_v" or settings.protection.resistance_ohm == 0.0]
-    found = {n: states.get(n, "ABSENT") for n in (*needed, *settings.channels.temperatures)}
-    if bad := [f"{n} is {s}" for n, s in found.items() if s != "OK"]:
+    by_channel = {n: states.get(n, "ABSENT") for n in (*needed, *settings.channels.temperatures)}
+    if bad := [f"{n} is {s}" for n, s in by_channel.items() if s != "OK"]:
         raise InputError(
             "a calibration needs the second encoder and the thermometers of all points; "
             + ", ".join(bad)
             + ": see `thermoctl doctor`"
         )
-    return Doctor(f"{len(found)} channels read well", dict(states))
+    return Doctor(f"{len(by_channel)} channels read well", dict(states))
 
 
 def response(settings: Settings, rig: drive.DrivenRig) -> Response:
@@ -165,10 +165,10 @@ def pid(rig: drive.DrivenRig) -> Pid:
     before = after = NOTHING
     said: list[str] = []
     try:
-        found = tune(rig, "imc", True, Keyboard(False), said.append)
-        proposed, before, after = found.proposed, found.before, found.after or NOTHING
+        tuned = tune(rig, "imc", True, Keyboard(False), said.append)
+        proposed, before, after = tuned.proposed, tuned.before, tuned.after or NOTHING
         summary = f"present: {before}; " + (
-            "nothing to change" if proposed == found.present else f"proposed, each step measured: {after}"
+            "nothing to change" if proposed == tuned.present else f"proposed, each step measured: {after}"
         )
     except (InputError, Disagrees) as e:
         summary = f"the present gains stay: {e}"

@@ -110,7 +110,7 @@ def _prove(
 ) -> Measured:
     """Run the loop with the gains of each step; return the margins measured with the last ones."""
     period_s, average = rig.settings.loop.period_s, int(rig.settings.control.moving_average)
-    found: Measured
+    measured: Measured
     for k, gains in enumerate(steps, 1):
         where = f"step {k} of {len(steps)} (kp {gains.kp:.4g}, ti_s {gains.ti_s:.4g}, td_s {gains.td_s:.4g})"
         try:
@@ -118,13 +118,13 @@ def _prove(
         except (InputError, HardwareError) as e:
             kind = type(e) if isinstance(e, InputError) else HardwareError
             raise kind(f"{where}: {e}; the gains of before are in force, nothing was written") from None
-        found = measure(rows, models[0], gains, period_s, average)
-        if contradiction := disagreement(found, models, gains, period_s, average):
+        measured = measure(rows, models[0], gains, period_s, average)
+        if contradiction := disagreement(measured, models, gains, period_s, average):
             raise Disagrees(
                 f"{where}: {contradiction}; the gains of before are in force, nothing was written"
             )
-        say(f"{where}: {found} measured")
-    return found
+        say(f"{where}: {measured} measured")
+    return measured
 
 
 def _present(rig: drive.DrivenRig) -> Gains:

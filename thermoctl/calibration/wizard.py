@@ -119,9 +119,9 @@ class Wizard:
 
     def result(self, step: str, kind: type[_R]) -> _R:
         """Return the result of a step that is done."""
-        found = self.done[step]
-        assert isinstance(found, kind)
-        return found
+        result = self.done[step]
+        assert isinstance(result, kind)
+        return result
 
     def run(self, keyboard: Keyboard) -> bool:
         """Do every step that is not done; False when it was ended early.

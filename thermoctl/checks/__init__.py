@@ -27,12 +27,12 @@ def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
     model = compile_plant(plant)
     tables = [in_plant_units(plant, t) for t in recordings]
     excitations = [model.excitation(t) for t in tables]
-    found = plant_findings(model, excitations)
+    findings = plant_findings(model, excitations)
     for table, excitation in zip(tables, excitations, strict=True):
-        found += data_findings(model, table, excitation)
-    if not any(f.severe for f in found):
+        findings += data_findings(model, table, excitation)
+    if not any(f.severe for f in findings):
         labels, cleared = label_findings(model, tables)
-        found += labels
+        findings += labels
         for table in cleared:
-            found += start_findings(model, model.excitation(table))
-    return sorted(found, key=lambda f: not f.severe)
+            findings += start_findings(model, model.excitation(table))
+    return sorted(findings, key=lambda f: not f.severe)

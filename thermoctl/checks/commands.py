@@ -32,11 +32,11 @@ def check(args: argparse.Namespace) -> int:
             f"{len(p.flows)} flows, {len(p.outputs)} outputs"
         )
         if args.data:
-            _, found = checked(p, args.data, args)
-            report(found, sys.stdout)
-            if not found:
+            _, findings = checked(p, args.data, args)
+            report(findings, sys.stdout)
+            if not findings:
                 print("the recordings fit the plant's labels, units and clock")
-            return int(any(f.severe for f in found))
+            return int(any(f.severe for f in findings))
         alone = file_findings(p)
         report(alone, sys.stdout)
         severe |= any(f.severe for f in alone)
@@ -59,9 +59,9 @@ def refit(args: argparse.Namespace) -> int:
 
     def read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
         """Read recordings; refuse those with a severe finding."""
-        tables, found = checked(plant, paths, args)
-        report(found, sys.stderr)
-        if any(f.severe for f in found) and not args.anyway:
+        tables, findings = checked(plant, paths, args)
+        report(findings, sys.stderr)
+        if any(f.severe for f in findings) and not args.anyway:
             raise InputError(
                 f"{plant.file}: not refitted: the checks above would make any number doubtful; correct the data or the "
                 "plant, or refit with --anyway"

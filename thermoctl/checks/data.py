@@ -30,22 +30,24 @@ SLOWS = 0.25  # a body comes to rest if its last steps are below this share of i
 
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     """Check the columns that the plant reads."""
-    found = _gaps(model, table, excitation)
+    findings = _gaps(model, table, excitation)
     read = [i for i in model.plant.readings() if i.column in table.columns]
     for item in read:
         there = np.isfinite(table.columns[item.column])
         values = table.columns[item.column][there]
         if not there.any():
-            found.append(_empty(table, item.name, item.column))
+            findings.append(_empty(table, item.name, item.column))
         elif len(values) >= FEW and item.name in model.plant.outputs:
             # A periodic input repeats by itself; measured noise does not.
-            found += _copies(table, item.column, values, table.t[there])
-            found += _resampled(table, item.column, values)
+            findings += _copies(table, item.column, values, table.t[there])
+            findings += _resampled(table, item.column, values)
     try:
         simulated = model.run(excitation).y
     except SimulationError:
-        return found
-    return found + _between(model, table, excitation, simulated) + _dead(model, table, excitation, simulated)
+        return findings
+    return (
+        findings + _between(model, table, excitation, simulated) + _dead(model, table, excitation, simulated)
+    )
 
 
 def _empty(table: Table, name: str, column: str) -> Finding:
@@ -188,7 +190,7 @@ def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> lis
 
 def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -> list[Finding]:
     """Find readings that stand still while the plant moves, and inputs that never move."""
-    found = []
+    findings = []
     noises = default_noise(model.plant, [excitation])
     sds = [float(np.hypot(o.noise_sd, (o.resolution or 0.0) / 12**0.5)) for o in model.plant.outputs.values()]
     for j, (o, noise) in enumerate(zip(model.plant.outputs.values(), noises, strict=True)):
@@ -198,7 +200,7 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             continue
         sd = sds[j]
         if np.ptp(y) == 0 and np.ptp(simulated) > SIGMAS * max(sd, 1e-3 * np.ptp(simulated)):
-            found.append(
+            findings.append(
                 Finding(
                     "still",
                     table.path,
@@ -207,13 +209,13 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
                 )
             )
             continue
-        found += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
+        findings += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
     scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
     driving = [i for i in driving_inputs(model.plant) if not _surroundings(i)]
     dead = driving and not any(moves(table, i.column) for i in driving)
     if dead and not _follows(excitation.y, run, scales) and not _by_itself(model, excitation, scales):
         names = ", ".join(f"'{i.column}'" for i in driving)
-        found.append(
+        findings.append(
             Finding(
                 "still",
                 table.path,
@@ -221,7 +223,7 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
                 "Was the right column logged? Without the inputs any effect could be named.",
             )
         )
-    return found
+    return findings
 
 
 def _follows(y: np.ndarray, run: np.ndarray, scales: Sequence[float]) -> bool:
@@ -242,10 +244,10 @@ def _follows(y: np.ndarray, run: np.ndarray, scales: Sequence[float]) -> bool:
 def _by_itself(model: Model, excitation: Excitation, scales: Sequence[float]) -> bool:
     """Return whether the plant moves like this without its inputs, by ringing or cooling from its start."""
     try:
-        found = refit.fit(model, [excitation], iterations=FREE)
+        fitted = refit.fit(model, [excitation], iterations=FREE)
     except (SimulationError, InputError):
         return False
-    return _follows(excitation.y, excitation.y - found.residuals[0], scales)
+    return _follows(excitation.y, excitation.y - fitted.residuals[0], scales)
 
 
 def driving_inputs(plant: Plant) -> list[Input]:

@@ -26,12 +26,12 @@ def file_findings(plant: Plant) -> list[Finding]:
 def _values(plant: Plant, seed: int = 0) -> dict[str, float]:
     """Return parameters as they are, and inputs and nodes at random values of a usual size."""
     rng = np.random.default_rng(seed)
-    found = {p.name: p.value for p in plant.parameters.values()} | {"t": 1.0}
+    values = {p.name: p.value for p in plant.parameters.values()} | {"t": 1.0}
     items: list[Input | Node] = [*plant.inputs.values(), *plant.nodes.values()]
     for item in items:
         warm = item.unit in _TEMPERATURES or item.role in ("ambient", "temperature")
-        found[item.name] = float(rng.uniform(20, 40) if warm else rng.uniform(0.1, 1))
-    return found
+        values[item.name] = float(rng.uniform(20, 40) if warm else rng.uniform(0.1, 1))
+    return values
 
 
 def _value(e: Expr, values: Mapping[str, float]) -> float:
@@ -40,13 +40,13 @@ def _value(e: Expr, values: Mapping[str, float]) -> float:
 
 
 def _storages(plant: Plant) -> list[Finding]:
-    found = []
+    findings = []
     for node in plant.nodes.values():
         if (
             ex.names(node.storage) <= set(plant.parameters)
             and not (q := _value(node.storage, _values(plant))) > 0
         ):
-            found.append(
+            findings.append(
                 Finding(
                     "storage",
                     f"{plant.file}:{node.at}",
@@ -54,30 +54,30 @@ def _storages(plant: Plant) -> list[Finding]:
                     "A negative heat capacity or mass turns every flow around: correct the sign.",
                 )
             )
-    return found
+    return findings
 
 
 def driving_away(plant: Plant) -> list[Flow]:
     """Return the flows that drive their own nodes away: they grow with the target or fall with the source."""
     values = [_values(plant, seed) for seed in range(POINTS)]
-    found = []
+    flows = []
     for flow in plant.flows.values():
         read = ex.names(flow.rate)
         own = [(e, way) for e, way in ((flow.source, -1.0), (flow.target, 1.0)) if e in read]
         slopes = [way * _value(ex.derivative(flow.rate, str(e)), v) for e, way in own for v in values]
         if slopes and min(slopes) > 0:
-            found.append(flow)
-    return found
+            flows.append(flow)
+    return flows
 
 
 def _signs(plant: Plant) -> list[Finding]:
     """Find a flow of a node by itself that drives the node away: it should hold it back."""
-    found = []
+    findings = []
     values = _values(plant)
     for flow in driving_away(plant):
         if _grows(plant, values) and not _grows(plant, values, flow.name):
             own = next(e for e in (flow.source, flow.target) if e in ex.names(flow.rate))
-            found.append(
+            findings.append(
                 Finding(
                     "sign",
                     f"{plant.file}:{flow.at}",
@@ -86,7 +86,7 @@ def _signs(plant: Plant) -> list[Finding]:
                     severe=False,
                 )
             )
-    return found
+    return findings
 
 
 def _grows(plant: Plant, values: dict[str, float], flip: str | None = None) -> bool:
@@ -107,14 +107,14 @@ def _scales(plant: Plant) -> list[Finding]:
         *(ex.names(o.value) for o in plant.outputs.values()),
         *(ex.names(n.initial) for n in plant.nodes.values()),
     )
-    found = []
+    findings = []
     for part in _parts(plant):
         flows = [f for f in plant.flows.values() if {f.source, f.target} & part]
         exprs = [f.rate for f in flows] + [plant.nodes[n].storage for n in part]
         scaled = free & frozenset().union(*map(ex.names, exprs))
         if scaled and not scaled & read and all(_homogeneous(plant, e, scaled) for e in exprs):
             names = ", ".join(sorted(scaled))
-            found.append(
+            findings.append(
                 Finding(
                     "scale",
                     plant.file,
@@ -123,7 +123,7 @@ def _scales(plant: Plant) -> list[Finding]:
                     severe=False,
                 )
             )
-    return found
+    return findings
 
 
 def _parts(plant: Plant) -> list[set[str]]:

@@ -65,18 +65,18 @@ class Hypothesis:
 def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding], list[Table]]:
     """Return the findings, and the tables after the corrections that they suggest."""
     tables = [_cut(t, ROWS // len(tables)) for t in tables]
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for _ in range(ROUNDS):
         best = _best(model, tables)
         if best is None:
             break
         where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
-        found.append(Finding(best.kind, where, best.what, best.suggestion))
+        findings.append(Finding(best.kind, where, best.what, best.suggestion))
         tables = [best.change(t) for t in tables]
         model = _model(model, best)
-    if not found:
-        found = _ambient(model.plant, tables)
-    return found, tables
+    if not findings:
+        findings = _ambient(model.plant, tables)
+    return findings, tables
 
 
 def _cut(table: Table, rows: int) -> Table:
@@ -292,21 +292,21 @@ def _corrections(item: Input | Output) -> list[Correction]:
     unit = item.unit
     kind = None if unit is None else dimension(unit)
     temperature = kind == dimension("K")
-    found: list[Correction] = []
+    corrections: list[Correction] = []
     if temperature and unit is not None:
-        found += [(f"in {u}", conversion(u, unit)) for u in TEMPERATURES if u != unit]
-        found += [("1000 times too large", (1e-3, 0.0)), ("in tenths of a degree", (0.1, 0.0))]
-        return found
+        corrections += [(f"in {u}", conversion(u, unit)) for u in TEMPERATURES if u != unit]
+        corrections += [("1000 times too large", (1e-3, 0.0)), ("in tenths of a degree", (0.1, 0.0))]
+        return corrections
     for factor in FACTORS:
         size = f"{factor:g} times too large" if factor > 1 else f"{1 / factor:g} times too small"
-        found.append((size, (1 / factor, 0.0)))
+        corrections.append((size, (1 / factor, 0.0)))
     if not kind:  # an angle, a ratio, or a number without a unit
-        found += [
+        corrections += [
             ("in deg instead of rad", (np.pi / 180, 0.0)),
             ("in rad instead of deg", (180 / np.pi, 0.0)),
         ]
-    found.append(("of the other sign", (-1.0, 0.0)))
-    return found
+    corrections.append(("of the other sign", (-1.0, 0.0)))
+    return corrections
 
 
 def _corrected(
@@ -356,7 +356,7 @@ INDOORS = (-5.0, 45.0)  # degC, weather-protected places: IEC 60721-3-3, class 3
 
 def _ambient(plant: Plant, tables: Sequence[Table]) -> list[Finding]:
     """Yield surroundings that are plausible only if their numbers are Fahrenheit or kelvin."""
-    found = []
+    findings = []
     for i, table in product(plant.inputs.values(), tables):
         if i.unit != "degC" or i.role != "ambient" or i.column not in table.columns:
             continue
@@ -364,7 +364,7 @@ def _ambient(plant: Plant, tables: Sequence[Table]) -> list[Finding]:
         for unit in ("degF", "K"):
             scale, offset = conversion(unit, "degC")
             if mean > INDOORS[1] and INDOORS[0] <= scale * mean + offset <= INDOORS[1]:
-                found.append(
+                findings.append(
                     Finding(
                         "unit",
                         table.path,
@@ -375,4 +375,4 @@ def _ambient(plant: Plant, tables: Sequence[Table]) -> list[Finding]:
                     )
                 )
                 break
-    return found
+    return findings

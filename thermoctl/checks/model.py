@@ -22,16 +22,16 @@ SIGMAS = 6.0  # standard deviations of a contradiction: probability 2e-9 for a n
 
 def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Finding]:
     """Check units, storages, stability and time constants."""
-    found = unit_findings(model.plant)
+    findings = unit_findings(model.plant)
     for excitation in excitations:
-        found += _storages(model, excitation)
-        if found and found[-1].kind == "storage":
-            return found
-        found += _stability(model, excitation)
-        if found and found[-1].kind == "unstable":
-            return found
-        found += _time_constants(model, excitation)
-    return _once(found)
+        findings += _storages(model, excitation)
+        if findings and findings[-1].kind == "storage":
+            return findings
+        findings += _stability(model, excitation)
+        if findings and findings[-1].kind == "unstable":
+            return findings
+        findings += _time_constants(model, excitation)
+    return _once(findings)
 
 
 def unit_findings(plant: Plant) -> list[Finding]:
@@ -68,11 +68,11 @@ def _value(e: ex.Expr, values: dict[str, float]) -> float:
 
 def _storages(model: Model, excitation: Excitation) -> list[Finding]:
     values = start_values(model, excitation)
-    found = []
+    findings = []
     for node in model.plant.nodes.values():
         storage = _value(node.storage, values)
         if not storage > 0:
-            found.append(
+            findings.append(
                 Finding(
                     "storage",
                     f"{model.plant.file}:{node.at}",
@@ -80,7 +80,7 @@ def _storages(model: Model, excitation: Excitation) -> list[Finding]:
                     "A negative heat capacity or mass turns every flow around: correct the sign.",
                 )
             )
-    return found
+    return findings
 
 
 def jacobian(plant: Plant, values: dict[str, float], flip: str | None = None) -> np.ndarray:
@@ -180,14 +180,14 @@ def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float,
     assert run.dy is not None
     spread = [np.ptp(p.range) / 12**0.5 if (p := plant.parameters[q]).range else 0.0 for q in model.active]
     spread += [plant.nodes[n].initial_sigma or 0.0 for n in model.uncertain]
-    found = {}
+    errors = {}
     noises = default_noise(plant, [excitation])
     for j, (o, noise) in enumerate(zip(plant.outputs.values(), noises, strict=True)):
         if ex.names(o.value) & set(model.states) and np.isfinite(excitation.y[0, j]):
             error = float(excitation.y[0, j] - run.y[0, j])
             sd = float(np.hypot(noise.sigma, np.linalg.norm(run.dy[0, j] * spread)))
-            found[o.name] = error, abs(error) / sd
-    return found
+            errors[o.name] = error, abs(error) / sd
+    return errors
 
 
 def start_findings(model: Model, excitation: Excitation) -> list[Finding]:

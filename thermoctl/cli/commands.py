@@ -63,10 +63,10 @@ def takes_axis(command: Command) -> bool:
 
 def _each_axis(function: Any, takes: list[str], args: argparse.Namespace) -> int:
     """Run a command for every axis; return the largest exit status."""
-    found = []
+    statuses = []
     for part in args.settings.axes:
         args.settings = part
         if not getattr(args, "json", False):
             print(f"axis {part.axis}:", flush=True)
-        found.append(function(*(getattr(args, t) for t in takes)) or 0)
-    return max(found)
+        statuses.append(function(*(getattr(args, t) for t in takes)) or 0)
+    return max(statuses)

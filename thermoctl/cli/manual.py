@@ -67,14 +67,14 @@ def manual_page(parser: argparse.ArgumentParser) -> str:
 
 def _commands(parser: argparse.ArgumentParser) -> list[tuple[argparse.ArgumentParser, str]]:
     """Return every command that is no group, with its line of help."""
-    found: list[tuple[argparse.ArgumentParser, str]] = []
+    listed: list[tuple[argparse.ArgumentParser, str]] = []
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             said = {choice.dest: choice.help or "" for choice in action._choices_actions}
             for name, command in action.choices.items():
                 below = _commands(command)
-                found += below or [(command, said.get(name, ""))]
-    return found
+                listed += below or [(command, said.get(name, ""))]
+    return listed
 
 
 def _text(words: str) -> str:

@@ -41,10 +41,10 @@ def versions() -> str:
     for requirement in metadata.requires("thermoctl") or ():
         name = re.split(r"[^\w.-]", requirement)[0]
         try:
-            found = metadata.version(name)
+            installed = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found = "not installed"
-        lines.append(f"{name} {found}")
+            installed = "not installed"
+        lines.append(f"{name} {installed}")
     return "\n".join(dict.fromkeys(lines)) + "\n"
 
 

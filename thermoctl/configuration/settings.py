@@ -367,15 +367,15 @@ def options() -> Iterator[tuple[str, dataclasses.Field[Any], Option]]:
 
 def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
     """List the options that differ, each with whether the change needs a restart."""
-    found = []
+    differing = []
     for key, f, row in options():
         section = key.split(".")[0]
         before, after = (_plain(getattr(getattr(s, section), f.name)) for s in (old, new))
         if before != after:
-            found.append((key, row.restart))
+            differing.append((key, row.restart))
     if old.channels != new.channels:
-        found.append((POINTS, True))
-    return found
+        differing.append((POINTS, True))
+    return differing
 
 
 def effective(settings: Settings) -> str:

@@ -35,13 +35,13 @@ def interpreted_law() -> ModuleType:
 
 def _lines(kind: str, names: Iterable[str], indent: str) -> list[str]:
     """Return declarations of the names, as many as fit on each line."""
-    found: list[str] = []
+    lines: list[str] = []
     for name in names:
-        if found and len(found[-1]) + len(name) + 2 <= _WIDTH:
-            found[-1] += f", {name}"
+        if lines and len(lines[-1]) + len(name) + 2 <= _WIDTH:
+            lines[-1] += f", {name}"
         else:
-            found.append(f"{indent}cdef {kind} {name}")
-    return found
+            lines.append(f"{indent}cdef {kind} {name}")
+    return lines
 
 
 def _kind(value: object) -> str:

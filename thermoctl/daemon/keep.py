@@ -72,13 +72,13 @@ def load(path: Path, model: CompensatorModel) -> tuple[np.ndarray | None, float,
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
-        found = json.loads(data) if len(data) <= MAX_BYTES else {}
-        age_s = _now_s() - float(found["at_s"])
-        if found["version"] != 1 or found["boot"] != _boot() or not 0.0 <= age_s <= KEEP_S:
+        saved = json.loads(data) if len(data) <= MAX_BYTES else {}
+        age_s = _now_s() - float(saved["at_s"])
+        if saved["version"] != 1 or saved["boot"] != _boot() or not 0.0 <= age_s <= KEEP_S:
             return None, 0.0, f"older than {KEEP_S:g} s or of another boot"
-        if found["model"] != _fingerprint(model):
+        if saved["model"] != _fingerprint(model):
             return None, 0.0, "of another model"
-        state = decode(found["state"])
+        state = decode(saved["state"])
         return (state, age_s, "") if np.isfinite(state).all() else (None, 0.0, "not finite")
     except FileNotFoundError:
         return None, 0.0, "none were kept"

@@ -61,40 +61,40 @@ class Misfit:
         NaN innovations (no sample yet) are left out.
         """
         rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
-        found = None
+        alarm = None
         if not self._watches or not rows.shape[1]:
-            return found
+            return alarm
         begins = np.flatnonzero(np.diff(rows[0], prepend=self._last_t) < 0.0)  # the clock restarted
         for k, part in enumerate(np.split(rows, begins, axis=1)):
             if k > 0:
                 self.restart()
-            found = self._add(part) or found
-        return found
+            alarm = self._add(part) or alarm
+        return alarm
 
     def _add(self, rows: np.ndarray) -> Alarm | None:
-        found = None
+        alarm = None
         if not rows.shape[1]:
-            return found
+            return alarm
         changed = (
             np.diff(rows[1], prepend=self._last_c) != 0.0
         )  # the signal holds between samples of the sensor
         self._last_t, self._last_c = rows[0, -1], rows[1, -1]
         if not changed.any():
-            return found
+            return alarm
         rows = np.hstack((self._rows, rows[:, changed]))
         while rows.shape[1] and rows[0, -1] >= rows[0, 0] + BLOCK_S:
             size = int(np.searchsorted(rows[0], rows[0, 0] + BLOCK_S)) + 1
-            found = self._block(rows[:, :size]) or found
+            alarm = self._block(rows[:, :size]) or alarm
             rows = rows[:, size:]
         self._rows = rows
-        return found
+        return alarm
 
     def _block(self, rows: np.ndarray) -> Alarm | None:
         share = self._gain * rows[2, -1]
         sigma = self._noise / math.sqrt(1.0 - share) if 0.0 <= share < 1.0 else self._noise
         mean, n = float(rows[1].mean()), max(1.0, rows.shape[1] / CORRELATED)
         z = max(-CLIP, min(CLIP, mean / (sigma / math.sqrt(n))))
-        found = None
+        alarm = None
         for side, sign in enumerate((1.0, -1.0)):
             if self.sums[side] == 0.0:
                 self._since[side], self._total[side], self._blocks[side] = float(rows[0, 0]), 0.0, 0
@@ -102,12 +102,12 @@ class Misfit:
             self._total[side] += mean
             self._blocks[side] += 1
             if self.sums[side] > LIMIT:
-                found = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
+                alarm = Alarm(self._since[side], float(rows[0, -1]), self._total[side] / self._blocks[side])
                 # the sum stops at the limit, so that it soon falls below it when the model fits again
                 self.sums[side] = LIMIT
-        new = found is not None and not self.alarmed
-        if found is not None:
+        new = alarm is not None and not self.alarmed
+        if alarm is not None:
             self.alarmed = True
         elif max(self.sums) == 0.0:
             self.alarmed = False
-        return found if new else None
+        return alarm if new else None

@@ -78,10 +78,10 @@ def read_law_metadata(text: str) -> dict[str, Any]:
 
     Keys: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel).
     """
-    found = json.loads(text)
-    if found["version"] != LAW_VERSION:
-        raise ValueError(f"law version {found['version']}, this program has version {LAW_VERSION}")
-    m = found["model"]
+    content = json.loads(text)
+    if content["version"] != LAW_VERSION:
+        raise ValueError(f"law version {content['version']}, this program has version {LAW_VERSION}")
+    m = content["model"]
     if unknown := set(m) - {*PLAIN, *ARRAYS}:
         raise ValueError(f"the model has {', '.join(sorted(unknown))}, which this program does not know")
     values: dict[str, Any] = {name: m[name] for name in PLAIN if name in m} | {
@@ -90,10 +90,10 @@ def read_law_metadata(text: str) -> dict[str, Any]:
     values |= {name: decode(m[name]["values"]).reshape(m[name]["shape"]) for name in ARRAYS if name in m}
     model = CompensatorModel(**values)
     return {
-        **found,
+        **content,
         "model": model,
-        "parameters": Parameters.unpack(decode(found["parameters"])),
-        "state": None if found["state"] is None else decode(found["state"]),
+        "parameters": Parameters.unpack(decode(content["parameters"])),
+        "state": None if content["state"] is None else decode(content["state"]),
     }
 
 

@@ -49,11 +49,11 @@ def _systemctl(*arguments: str) -> int:
 
 def units(root: Path = Path("/")) -> dict[str, Path]:
     """Return the installed units below `root`, each with the configuration that it runs."""
-    found = {}
+    by_name = {}
     for path in sorted((root / UNITS).glob("thermoctl*.service")):
         if config := re.search(r"^ExecStart=.* --config (.+)$", path.read_text(), re.MULTILINE):
-            found[path.name] = Path(config[1]).resolve()
-    return found
+            by_name[path.name] = Path(config[1]).resolve()
+    return by_name
 
 
 def _unit_for(settings: Settings) -> str | None:
@@ -70,8 +70,8 @@ def _unit_of(pid: int) -> str | None:
         groups = Path(f"/proc/{pid}/cgroup").read_text()
     except OSError:
         return None
-    found = re.search(r"/(thermoctl[^/\n]*\.service)$", groups, re.MULTILINE)
-    return found[1] if found else None
+    match = re.search(r"/(thermoctl[^/\n]*\.service)$", groups, re.MULTILINE)
+    return match[1] if match else None
 
 
 def journal(settings: Settings, size: int) -> str:
@@ -101,9 +101,9 @@ def start(settings: Settings) -> int:
     while time.monotonic() < deadline and (process is None or process.poll() is None):
         pid = holder(settings)
         with contextlib.suppress(InputError):
-            found = [ask(part.socket.path, {"command": "status"}) for part in settings.parts]
-            if all(map(settled, found)) and pid is not None and (process is None or pid == process.pid):
-                print(f"started (pid {pid}, {', '.join(now['state'] for now in found)}, log {log})")
+            answers = [ask(part.socket.path, {"command": "status"}) for part in settings.parts]
+            if all(map(settled, answers)) and pid is not None and (process is None or pid == process.pid):
+                print(f"started (pid {pid}, {', '.join(now['state'] for now in answers)}, log {log})")
                 return 0
         time.sleep(0.1)
     if process is not None:
@@ -222,7 +222,7 @@ def unseen(settings: Settings) -> list[str]:
     The unit sees no home and no temporary folder (ProtectHome=, PrivateTmp=), and writes only below
     /var/lib/thermoctl and /run/thermoctl (ProtectSystem=strict).
     """
-    found, config = [], Path(settings.path).resolve()
+    problems, config = [], Path(settings.path).resolve()
     program = {
         "program": _program(),
         "its Python": Path(sys.base_prefix),
@@ -230,20 +230,22 @@ def unseen(settings: Settings) -> list[str]:
     }
     hidden = [f"{what} {path}" for what, path in program.items() if _is_below(path, HIDDEN)]
     if hidden:
-        found.append(
+        problems.append(
             f"{', '.join(hidden)}: install it with the system's Python: python3 -m venv /opt/thermoctl, then "
             "/opt/thermoctl/bin/pip install the wheel (`make wheel`) with the extra [rig]"
         )
     if _is_below(config, HIDDEN):
-        found.append(f"configuration {config}: cp -r {config.parent} /etc/thermoctl")
+        problems.append(f"configuration {config}: cp -r {config.parent} /etc/thermoctl")
     else:
-        found += [
+        problems += [
             f"{path}: cp it to {config.parent} and name it there"
             for path in _files(settings)
             if _is_below(path, HIDDEN)
         ]
         if not config.stat().st_mode & 0o004 and config.stat().st_mode & 0o777:
-            found.append(f"configuration {config}: not readable for the user thermoctl: chmod o+r {config}")
+            problems.append(
+                f"configuration {config}: not readable for the user thermoctl: chmod o+r {config}"
+            )
     for part in settings.parts:
         for key, path, place in (
             ("recording.directory", part.recording.directory, STATE / "recordings"),
@@ -259,9 +261,9 @@ def unseen(settings: Settings) -> list[str]:
             ),
         ):
             line = f"{key} {path}: write {key}: {place}"
-            if path and not _is_below(Path(path), (STATE, RUN)) and line not in found:
-                found.append(line)
-    return found
+            if path and not _is_below(Path(path), (STATE, RUN)) and line not in problems:
+                problems.append(line)
+    return problems
 
 
 def _files(settings: Settings) -> list[Path]:

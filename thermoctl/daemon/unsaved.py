@@ -49,8 +49,8 @@ class Unsaved:
 
 def unsaved(shared: Shared) -> list[dict[str, Any]]:
     """List the data that cannot be saved now: what, why, since_s (seconds since 1970)."""
-    found = {name: _read(shared.unsaved[name]) for name in UNSAVED}
-    return [{"what": name, **now} for name, now in found.items() if now]
+    reasons = {name: _read(shared.unsaved[name]) for name in UNSAVED}
+    return [{"what": name, **now} for name, now in reasons.items() if now]
 
 
 def _read(box: Any) -> dict[str, Any]:

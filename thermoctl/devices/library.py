@@ -62,14 +62,14 @@ def search(words: list[str]) -> int:
     """Print the profiles in which every word stands; return 1 when there is none.
 
     Searched are name, vendor, model, bus, manual and channels."""
-    found = 0
+    count = 0
     for row, text in _rows():
         if all(w.lower() in text for w in words):
             print(row)
-            found += 1
-    if not found:
+            count += 1
+    if not count:
         print(f"no profile with {' '.join(words)}: write one with `thermoctl devices new`")
-    return EXIT_OK if found else EXIT_NONE
+    return EXIT_OK if count else EXIT_NONE
 
 
 def show(name: str) -> int:

@@ -60,9 +60,9 @@ def _keys(ask: Callable[[str], str], table: str, indent: int) -> list[str]:
     """Return the lines of a section; lists and mappings are typed as YAML: [a, b], {key: value}."""
     lines = []
     for key in TABLES[table]:
-        found = _answer(ask, key)
-        if found:
-            text = _quoted(found) if key.kind == "text" else found
+        answer = _answer(ask, key)
+        if answer:
+            text = _quoted(answer) if key.kind == "text" else answer
             lines.append(f"{' ' * indent}{key.name}: {text}")
     return lines or ([f"{' ' * indent}{{}}"] if indent else [])
 
@@ -73,9 +73,9 @@ def _answer(ask: Callable[[str], str], key: Key) -> str:
     example = f", as {key.example}" if key.example else ""
     default = "" if key.default is REQUIRED else f" [{key.default}]"
     while True:
-        found = ask(f"{key.name} ({key.meaning}{unit}{example}){default}: ").strip()
-        if found or key.default is not REQUIRED:
-            return found
+        answer = ask(f"{key.name} ({key.meaning}{unit}{example}){default}: ").strip()
+        if answer or key.default is not REQUIRED:
+            return answer
 
 
 def _quoted(text: str) -> str:

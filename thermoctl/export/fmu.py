@@ -128,8 +128,8 @@ def _variables(plant: Plant, e: Equations, numbers: Values, begin: list[float]) 
         real = "".join(f" {k}={quoteattr(v)}" for k, v in more.items() if k != "description")
         real += f" unit={quoteattr(unit)}" if unit else ""
         real += f' start="{start!r}"' if start is not None else ""
-        told = f" description={quoteattr(more['description'])}" if "description" in more else ""
-        return f'    <ScalarVariable name={quoteattr(name)} valueReference="{next(count)}"{told} {kind}><Real{real}/></ScalarVariable>'
+        description = f" description={quoteattr(more['description'])}" if "description" in more else ""
+        return f'    <ScalarVariable name={quoteattr(name)} valueReference="{next(count)}"{description} {kind}><Real{real}/></ScalarVariable>'
 
     for i, value in zip(plant.inputs.values(), begin, strict=True):
         change = "continuous" if i.linear else "discrete"
@@ -143,8 +143,8 @@ def _variables(plant: Plant, e: Equations, numbers: Values, begin: list[float]) 
         yield variable(f"width_{k}", tunable, None, width, description=text)
     fixed = 'causality="parameter" variability="fixed" initial="exact"'
     for o in first_outputs(plant):
-        told = f"first recorded value of {o}"
-        yield variable(f"first_{o}", fixed, plant.outputs[o].unit, numbers.first[o], description=told)
+        description = f"first recorded value of {o}"
+        yield variable(f"first_{o}", fixed, plant.outputs[o].unit, numbers.first[o], description=description)
     for n in plant.nodes.values():
         yield variable(
             f"shift_{n.name}", fixed, None, 0.0, description=f"added to the initial value of {n.name}"

@@ -160,14 +160,14 @@ def _unique(plant: Plant) -> dict[str, str]:
     """Return a name of each quantity and flow that no keyword and no other name is.
 
     Flows have keys "flow NAME", outputs "output NAME": they may be called as another quantity."""
-    taken, found = set(_RESERVED), {}
+    taken, names = set(_RESERVED), {}
 
     def take(key: str, wanted: str) -> None:
         """Keep a name for `key`: the wanted one, with `_` added until it is free."""
         while wanted in taken:
             wanted += "_"
         taken.add(wanted)
-        found[key] = wanted
+        names[key] = wanted
 
     for name in (*plant.inputs, *plant.parameters, *plant.nodes):
         take(name, name)
@@ -175,7 +175,7 @@ def _unique(plant: Plant) -> dict[str, str]:
         take(f"output {name}", name)
     for name in plant.flows:
         take(f"flow {name}", name if name not in taken else f"flow_{name}")
-    return found
+    return names
 
 
 def _parameters(plant: Plant, numbers: Values) -> str:

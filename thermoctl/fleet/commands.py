@@ -47,12 +47,12 @@ def diagnose_folders(args: argparse.Namespace) -> int:
         raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
     jobs, out = _jobs(args), Path(args.out)
     run_all(jobs, out, args.scheduler, args.workers, progress=None if args.quiet else Reporter())
-    found = [_diagnosis(job, out) for job in jobs]
+    diagnoses = [_diagnosis(job, out) for job in jobs]
     if args.json:
-        print(json.dumps([asdict(d) for d in found], indent=1))
+        print(json.dumps([asdict(d) for d in diagnoses], indent=1))
     elif not args.quiet:
-        Console(soft_wrap=True).print(_diagnoses(found))
-        _print_laws(found)
+        Console(soft_wrap=True).print(_diagnoses(diagnoses))
+        _print_laws(diagnoses)
         print(f"reports: {out}/RIG/report.html")
     return 0
 

@@ -42,15 +42,15 @@ class Shared:
 
 def shared(laws: Mapping[str, Mapping[str, Any]]) -> list[Shared]:
     """Return the shapes of terms that two or more rigs have. `laws`: `remainder.law` of each rig's result."""
-    found: dict[Term, dict[str, tuple[float, float]]] = {}
+    by_term: dict[Term, dict[str, tuple[float, float]]] = {}
     for rig, law in laws.items():
         for t in law.get("forms", ()):
             for shape, name in t["shapes"].items():
                 p = law["parameters"][name]
                 if p["sd"]:
                     key = (law["into"], t["form"], tuple(t["variables"]), shape)
-                    found.setdefault(key, {})[rig] = (p["value"], p["sd"])
-    return [_shared(term, values) for term, values in found.items() if len(values) > 1]
+                    by_term.setdefault(key, {})[rig] = (p["value"], p["sd"])
+    return [_shared(term, values) for term, values in by_term.items() if len(values) > 1]
 
 
 def _shared(term: Term, values: Mapping[str, tuple[float, float]]) -> Shared:

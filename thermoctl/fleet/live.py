@@ -68,11 +68,11 @@ def alarms(settings: Settings, table: Table) -> list[Alarm]:
     out = []
     for k in range(0, len(table.t), STRIDE):
         rows = slice(k, k + STRIDE)  # in pieces as in the daemon, so that a temporary alarm is not lost
-        found = watch.add(
+        alarm = watch.add(
             table.t[rows], table.columns["innovation_c"][rows], table.columns["kalman_gain"][rows]
         )
-        if found is not None:
-            out.append(found)
+        if alarm is not None:
+            out.append(alarm)
     return out
 
 

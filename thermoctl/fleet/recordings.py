@@ -16,12 +16,12 @@ def find_recordings(folder: str | Path) -> list[str]:
     """Find all recordings below a folder: 10 Hz tiers, Parquet, CSV and Arrow files.
 
     Raises InputError without one."""
-    found = sorted(str(p) for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
-    if not found:
+    paths = sorted(str(p) for p in Path(folder).rglob("*") if p.is_file() and p.name.endswith(SUFFIXES))
+    if not paths:
         raise InputError(
             f"{folder}: no recordings in it; files ending in {', '.join(SUFFIXES)} were expected"
         )
-    return found
+    return paths
 
 
 def expanded(given: Sequence[str], together: bool) -> list[str]:
@@ -33,10 +33,10 @@ def expanded(given: Sequence[str], together: bool) -> list[str]:
         if together and Path(name).is_dir():
             out += find_recordings(name)
         elif glob.has_magic(name) and not Path(name).exists():
-            found = sorted(glob.glob(name, recursive=True))
-            if not found:
+            matches = sorted(glob.glob(name, recursive=True))
+            if not matches:
                 raise InputError(f"{name}: no file matches; a pattern of recordings was expected")
-            out += found
+            out += matches
         else:
             out.append(name)
     return out

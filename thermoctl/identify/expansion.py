@@ -220,12 +220,12 @@ class Bank:
         best = (np.inf, 0, np.zeros(m + 2))
         for k in range(len(self.poles)):
             rows = self._rows(k)
-            found = optimize.lsq_linear(
+            solution = optimize.lsq_linear(
                 rows[:, m:-1], rows[:, -1], (np.append(low, -free), np.append(high, free))
             )
-            criterion = self.cost[k] + 2 * found.cost
+            criterion = self.cost[k] + 2 * solution.cost
             if criterion < best[0]:
-                best = (criterion, k, found.x)
+                best = (criterion, k, solution.x)
         _, k, theta = best
         f = float(self.poles[k])
         return Expansion(

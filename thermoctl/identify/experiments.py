@@ -246,7 +246,7 @@ def design_pulses(
     InputError when they do not fit."""
     unit = active_s / (4 * count)
     lengths = [v for v in (0.5 * unit, unit, 1.5 * unit, 2 * unit, 3 * unit, 4 * unit) if v >= least_s]
-    best, found = -np.inf, None
+    best, pulses = -np.inf, None
     for parts in product(lengths, repeat=2 * count):
         if abs(sum(parts) - active_s) > 1e-6 * active_s:
             continue
@@ -256,10 +256,10 @@ def design_pulses(
         ).mean()
         score = np.log(power.reshape(4, 6).mean(1)).mean() - 0.5 * np.log(above)
         if score > best + 1e-12:
-            best, found = score, parts
-    if found is None:
+            best, pulses = score, parts
+    if pulses is None:
         raise InputError(f"{count} pulses of at least {least_s:g} s with gaps do not fit into {active_s:g} s")
-    return list(found[::2]), list(found[1::2])
+    return list(pulses[::2]), list(pulses[1::2])
 
 
 def _pulse_power(widths: Sequence[float], gaps: Sequence[float], f: np.ndarray) -> np.ndarray:

@@ -220,7 +220,7 @@ def _fit(
         off = D - Q @ (Q.T @ D)
         return np.stack([-(off[:, owner == k] @ theta[owner == k]).ravel() for k in range(len(x))], axis=1)
 
-    found = optimize.least_squares(
+    solution = optimize.least_squares(
         lambda x: parts(x)[2].ravel(),
         np.log(tau),
         slopes,
@@ -228,8 +228,8 @@ def _fit(
         ftol=1e-7,
         max_nfev=iterations,
     )
-    x = np.sort(found.x)
-    return _Fit(np.exp(x), parts(x)[1], 2 * found.cost, found.nfev)
+    x = np.sort(solution.x)
+    return _Fit(np.exp(x), parts(x)[1], 2 * solution.cost, solution.nfev)
 
 
 def identify(

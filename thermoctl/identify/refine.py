@@ -91,6 +91,6 @@ def by_prediction_errors(
         return np.stack([(p @ root.T).ravel() for p in parts], axis=1)
 
     start = np.concatenate([np.diag(model.a), model.b.ravel(), gain.ravel(), model.c.ravel()])
-    found = optimize.least_squares(residuals, start, slopes, ftol=1e-6, x_scale="jac", max_nfev=most)
-    refined, gain = at(found.x)
-    return replace(refined, info={**model.info, "prediction_error": 2 * found.cost / y.size}), gain
+    solution = optimize.least_squares(residuals, start, slopes, ftol=1e-6, x_scale="jac", max_nfev=most)
+    refined, gain = at(solution.x)
+    return replace(refined, info={**model.info, "prediction_error": 2 * solution.cost / y.size}), gain

@@ -321,8 +321,8 @@ def share_of_margins(
     models: Sequence[SecondOrder], gains: Gains, period_s: float, moving_average: int = 1
 ) -> float:
     """Return the smallest margin on any model as a share of the wanted one: 1 or more is good, 0 unstable."""
-    found = [margins(m, gains, period_s, moving_average) for m in models]
-    return min(min(m.phase_deg / WANTED_DEG, m.gain / WANTED_GAIN) if m.stable else 0.0 for m in found)
+    by_model = [margins(m, gains, period_s, moving_average) for m in models]
+    return min(min(m.phase_deg / WANTED_DEG, m.gain / WANTED_GAIN) if m.stable else 0.0 for m in by_model)
 
 
 def robust(
@@ -424,18 +424,18 @@ def write_values(config: Path, section: str, values: dict[str, str], axis: str =
     text = config.read_text(encoding="utf-8")
     place = ["axes", axis, section] if axis else [section]
     by_hand = ", ".join(f"{n}: {v}" for n, v in values.items())
-    found = _body(text, place)
-    if found is None and axis and (above := _body(text, place[:-1])) is not None:
+    span = _body(text, place)
+    if span is None and axis and (above := _body(text, place[:-1])) is not None:
         begin, _, indent = above
         if not re.search(rf"^{indent}{section}:", text[slice(*above[:2])], re.MULTILINE):
             head = f"{indent}{section}:\n"
             text = text[:begin] + head + text[begin:]
-            found = begin + len(head), begin + len(head), indent + "  "
-    if found is None:
+            span = begin + len(head), begin + len(head), indent + "  "
+    if span is None:
         raise InputError(
             f"{config}: no section '{'.'.join(place)}' with lines of its own; write by hand: {by_hand}"
         )
-    begin, end, indent = found
+    begin, end, indent = span
     body = text[begin:end]
     for name, value in reversed(values.items()):  # a new line goes before those that are there
         line = re.compile(rf"^({indent}{name}:[ \t]*)[^#\n]*?([ \t]*(?:#.*)?)$", re.MULTILINE)
@@ -454,9 +454,9 @@ def _body(text: str, place: Sequence[str]) -> tuple[int, int, str] | None:
     begin, end, indent = 0, len(text), ""
     for key in place:
         below = rf"^{indent}{key}:[ \t]*(?:#.*)?\n((?:{indent}[ \t]+.*\n|\s*\n|[ \t]*#.*\n)*)"
-        found = re.compile(below, re.MULTILINE).search(text, begin, end)
-        inner = found and re.search(r"^([ \t]+)[^\s#]", found[1], re.MULTILINE)
-        if not (found and inner):
+        match = re.compile(below, re.MULTILINE).search(text, begin, end)
+        inner = match and re.search(r"^([ \t]+)[^\s#]", match[1], re.MULTILINE)
+        if not (match and inner):
             return None
-        begin, end, indent = found.start(1), found.end(1), inner[1]
+        begin, end, indent = match.start(1), match.end(1), inner[1]
     return begin, end, indent

@@ -33,7 +33,7 @@ Reader = Callable[[Plant, Sequence[str], argparse.Namespace], list[Table]]
 
 def ends_of_tables(plant: Plant) -> dict[str, float]:
     """Return the last time, s, of every table over time, by the flow, output or node that reads it."""
-    found: dict[str, float] = {}
+    ends: dict[str, float] = {}
     holders = {f.name: f.rate for f in plant.flows.values()} | {
         o.name: o.value for o in plant.outputs.values()
     }
@@ -43,8 +43,8 @@ def ends_of_tables(plant: Plant) -> dict[str, float]:
         for e in ex.walk(expr):
             if e.op == "table" and e.args[0].op == "name" and e.args[0].value == "t":
                 last = float(ex.evaluate(e.args[int(e.value or 0)], values))
-                found[name] = min(found.get(name, last), last)
-    return found
+                ends[name] = min(ends.get(name, last), last)
+    return ends
 
 
 def _warn_of_tables(plant: Plant, recording: str, last: float) -> None:

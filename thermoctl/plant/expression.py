@@ -85,13 +85,13 @@ _INTERNED: dict[tuple[str, tuple[int, ...], Any], Expr] = {}
 def make(op: str, *args: Expr, value: Any = None) -> Expr:
     """Return the one node of this operation and these arguments."""
     key = (op, tuple(map(id, args)), value)
-    found = _INTERNED.get(key)
-    if found is None:
+    node = _INTERNED.get(key)
+    if node is None:
         if len(_INTERNED) > 2_000_000:  # only a process that reads very many plants gets here
             _INTERNED.clear()
             _INTERNED.update({("num", (), 0.0): ZERO, ("num", (), 1.0): ONE})
-        found = _INTERNED[key] = Expr(op, args, value)
-    return found
+        node = _INTERNED[key] = Expr(op, args, value)
+    return node
 
 
 def _remade(op: str, args: tuple[Expr, ...], value: Any) -> Expr:

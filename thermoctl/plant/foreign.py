@@ -155,13 +155,13 @@ class _Plant:
         points = {
             n: v.start + (abs(v.start) or 1.0) * random.uniform(-0.1, 0.1, PROBES) for n, v in free.items()
         }
-        found = {}
+        state_of = {}
         for output in fmu.outputs:
             y = fmu.evaluate(output, tuple(points), [0.0, *points.values()])
             for state in fmu.states:
                 if state in fmu.depends[output] and np.array_equal(y, points[state]):
-                    found[output] = state
-        return found
+                    state_of[output] = state
+        return state_of
 
 
 def _range(v: Variable) -> dict[str, list[float]]:

@@ -112,9 +112,9 @@ def _input(name: str, s: Section) -> Input:
     stated = s.get("between_samples", False) is not None
     linear = s.text("between_samples", "hold", ("hold", "linear")) == "linear"
     column, conversion = _column(s, name)
-    found = Input(name, _unit(s), column, linear, _role(s), conversion, stated, _at(s))
+    item = Input(name, _unit(s), column, linear, _role(s), conversion, stated, _at(s))
     s.end()
-    return found
+    return item
 
 
 def _parameter(name: str, s: Section) -> Parameter:
@@ -139,13 +139,13 @@ def _parameter(name: str, s: Section) -> Parameter:
                 f"values of '{name}' must map recordings to numbers, and needs per_recording: true"
             )
         values = {recording: number_of(v, f"values of '{name}'") for recording, v in node.value.items()}
-    found = Parameter(name, value, _unit(s), limits, per_recording, values, _at(s))
+    item = Parameter(name, value, _unit(s), limits, per_recording, values, _at(s))
     s.end()
-    return found
+    return item
 
 
 def _node(name: str, s: Section) -> Node:
-    found = Node(
+    item = Node(
         name,
         _expression(s, "storage"),
         _expression(s, "initial"),
@@ -155,7 +155,7 @@ def _node(name: str, s: Section) -> Node:
         _at(s),
     )
     s.end()
-    return found
+    return item
 
 
 def _flow(name: str, s: Section, nodes: Iterable[str]) -> Flow:
@@ -166,9 +166,9 @@ def _flow(name: str, s: Section, nodes: Iterable[str]) -> Flow:
         raise s.node.error(f"flow '{name}' has neither 'from' nor 'into'; one node at least was expected")
     if source == target:
         raise s.node.error(f"flow '{name}' leads from '{source}' to itself")
-    found = Flow(name, rate, source, target, _unit(s), _at(s))
+    item = Flow(name, rate, source, target, _unit(s), _at(s))
     s.end()
-    return found
+    return item
 
 
 def _end(s: Section, key: str, nodes: list[str]) -> str | None:
@@ -185,7 +185,7 @@ def _end(s: Section, key: str, nodes: list[str]) -> str | None:
 
 def _output(name: str, s: Section) -> Output:
     column, conversion = _column(s, name)
-    found = Output(
+    item = Output(
         name,
         _expression(s, "value"),
         _unit(s),
@@ -197,7 +197,7 @@ def _output(name: str, s: Section) -> Output:
         _at(s),
     )
     s.end()
-    return found
+    return item
 
 
 def _noise(s: Section) -> float | SensorNoise | None:
@@ -213,9 +213,9 @@ def _noise(s: Section) -> float | SensorNoise | None:
         drift, time = parts.number("drift", low=0.0), parts.number("time", low=0.0)
         if time == 0:
             raise parts.get("time").error(f"{parts.label('time')}: a time constant above 0 s was expected")
-    found = SensorNoise(white, drift, time, flicker, parts.optional_number("sd", low=0.0))
+    noise = SensorNoise(white, drift, time, flicker, parts.optional_number("sd", low=0.0))
     parts.end()
-    return found
+    return noise
 
 
 def _role(s: Section) -> str | None:
@@ -250,13 +250,13 @@ def _column(s: Section, name: str) -> tuple[str, Conversion | None]:
             raise node.error(
                 f"{s.what}: the column's unit is given, its own is not; a 'unit' beside it was expected"
             )
-        found = Conversion(unit, c.number("scale", 1.0), c.number("offset", 0.0))
+        conversion = Conversion(unit, c.number("scale", 1.0), c.number("offset", 0.0))
         c.end()
-        if found.scale == 0 or (unit and {"scale", "offset"} & set(node.value)):
+        if conversion.scale == 0 or (unit and {"scale", "offset"} & set(node.value)):
             raise node.error(
                 f"{s.label('column')}: either 'unit', or 'scale' (not 0) and 'offset' were expected"
             )
-        return column, found
+        return column, conversion
     if not isinstance(node.value, str) or not node.value:
         raise node.error(f"{s.label('column')}: a column's name was expected, found {kind_of(node)}")
     return node.value, None
@@ -298,13 +298,13 @@ def _places(plant: Plant, items: Items) -> list[_Place]:
         delays = next((r for r in rules if r in ("inputs", "all")), "no")
         return _Place(s.label(key), e, s.get(key), names, delays, "first" in rules)
 
-    found = []
+    places = []
     for n in plant.nodes.values():
-        found.append(place("nodes", n.name, "storage", n.storage, parameters | inputs | nodes))
-        found.append(place("nodes", n.name, "initial", n.initial, inputs | parameters, "first"))
-    found += [place("flows", f.name, "rate", f.rate, everything, "inputs") for f in plant.flows.values()]
-    found += [place("outputs", o.name, "value", o.value, everything, "all") for o in plant.outputs.values()]
-    return found
+        places.append(place("nodes", n.name, "storage", n.storage, parameters | inputs | nodes))
+        places.append(place("nodes", n.name, "initial", n.initial, inputs | parameters, "first"))
+    places += [place("flows", f.name, "rate", f.rate, everything, "inputs") for f in plant.flows.values()]
+    places += [place("outputs", o.name, "value", o.value, everything, "all") for o in plant.outputs.values()]
+    return places
 
 
 def _check_names(plant: Plant, items: Items) -> None:

@@ -36,8 +36,8 @@ def gaps(t: np.ndarray) -> np.ndarray:
     median = float(np.median(steps))
     regular = np.mean(np.abs(steps - median) <= REGULAR * median) > 1 - 1 / MANY
     limit = MISSED * median if regular else median * log(len(steps) / ALARM) / log(2)
-    found = np.flatnonzero(steps > limit)
-    return found if len(found) <= max(3, len(steps) // MANY) else np.zeros(0, int)
+    rows = np.flatnonzero(steps > limit)
+    return rows if len(rows) <= max(3, len(steps) // MANY) else np.zeros(0, int)
 
 
 def in_parts(plant: Plant, table: Table) -> list[Table]:
@@ -47,9 +47,9 @@ def in_parts(plant: Plant, table: Table) -> list[Table]:
     measured = [table.columns[o.column] for o in plant.outputs.values() if o.column in table.columns]
     if not any(np.isfinite(y).any() for y in measured):
         return [table]
-    found = gaps(table.t)
+    rows = gaps(table.t)
     moving = [i.column for i in plant.inputs.values() if _moves(table, i.column)]
-    jumps = [k for k in found.tolist() if moving or _goes_on(plant, table, k)]
+    jumps = [k for k in rows.tolist() if moving or _goes_on(plant, table, k)]
     if not jumps:
         return [table]
     notes = [_cut(plant, table, k) for k in jumps]

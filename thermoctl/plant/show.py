@@ -192,8 +192,8 @@ def _size(text: Text, canvas: FigureCanvasAgg, inch: float) -> np.ndarray:
     box = text.get_bbox_patch()
     style: Any = box.get_boxstyle() if box else None
     pad = 2 * float(text.get_fontsize()) / 72 * (style.pad if style else 0.1)
-    found = text.get_window_extent(cast(Any, canvas).get_renderer())
-    return np.array([found.width, found.height]) / inch + pad
+    extent = text.get_window_extent(cast(Any, canvas).get_renderer())
+    return np.array([extent.width, extent.height]) / inch + pad
 
 
 def _places(vertices: list[Vertex], edges: list[Edge], sizes: np.ndarray, widest: float) -> np.ndarray:
@@ -231,14 +231,14 @@ def _places(vertices: list[Vertex], edges: list[Edge], sizes: np.ndarray, widest
 def _box(axes: Axes, vertex: Vertex, marked: Collection[str]) -> Text:
     kind, key, label = vertex
     edge, face, size, _ = _STYLE[kind]
-    found = key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked)
-    edge = _MARKED if found else edge
+    is_marked = key in marked if kind == "node" else not set(label.split("\n")).isdisjoint(marked)
+    edge = _MARKED if is_marked else edge
     style = f"round,pad={_PAD[kind == 'node']}"
     shape = {
         "boxstyle": style,
         "fc": face,
         "ec": edge,
-        "lw": 2.0 if found else 1.2 if kind == "node" else 0.6,
+        "lw": 2.0 if is_marked else 1.2 if kind == "node" else 0.6,
     }
     return axes.text(0, 0, label, ha="center", va="center", fontsize=size, color=edge, zorder=3, bbox=shape)
 

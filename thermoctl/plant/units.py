@@ -224,12 +224,12 @@ def in_plant_units(plant: Plant, table: Table) -> Table:
 
 def as_recorded(plant: Plant, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return columns in the plant's units, converted back to the units in which the plant reads a file."""
-    found = dict(columns)
+    converted = dict(columns)
     for item in plant.readings():
-        if item.conversion and item.column in found:
+        if item.conversion and item.column in converted:
             scale, offset = _stated(item)
-            found[item.column] = (columns[item.column] - offset) / scale
-    return found
+            converted[item.column] = (columns[item.column] - offset) / scale
+    return converted
 
 
 def _stated(item: Input | Output) -> tuple[float, float]:

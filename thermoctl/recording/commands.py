@@ -27,15 +27,15 @@ def list_recordings(args: argparse.Namespace) -> int:
         raise InputError(
             f"{folder}: no such folder; name the one that recording.directory of the configuration says"
         )
-    found: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     places = [folder, *(p for p in folder.iterdir() if p.is_dir())]  # an axis' recordings: its own folder
     for path in sorted(p for place in places for kind in (FULL, TIER) for p in recording_files(place, kind)):
         try:
             i = info(path)
         except InputError as e:
-            found.append({"path": str(path), "error": str(e)})
+            entries.append({"path": str(path), "error": str(e)})
             continue
-        found.append(
+        entries.append(
             {
                 "path": str(path),
                 "rig": i.meta.get("rig") or UNKNOWN_RIG,
@@ -48,11 +48,11 @@ def list_recordings(args: argparse.Namespace) -> int:
             }
         )
     if args.json:
-        print(json.dumps([{k: None if v != v else v for k, v in f.items()} for f in found], indent=1))
+        print(json.dumps([{k: None if v != v else v for k, v in f.items()} for f in entries], indent=1))
         return 0
-    found.sort(key=lambda f: (f.get("rig", ""), f.get("run", ""), f["path"]))
+    entries.sort(key=lambda f: (f.get("rig", ""), f.get("run", ""), f["path"]))
     heading = None
-    for f in found:
+    for f in entries:
         if "rig" in f and (f["rig"], f["run"]) != heading:
             heading = f["rig"], f["run"]
             print(f"{f['rig']}{', run ' + f['run'] if f['run'] else ''}:")
@@ -62,7 +62,7 @@ def list_recordings(args: argparse.Namespace) -> int:
             else f"  {f['path']}  {f['begins']}  {f['rows']} rows  {f['seconds']:.3f} s  "
             f"{f['bytes'] / 1e6:.2f} MB{'' if f['whole'] else '  not closed (killed, or still recording)'}"
         )
-    if not found:
+    if not entries:
         print(f"{folder}: no recordings")
     return 0
 

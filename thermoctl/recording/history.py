@@ -106,9 +106,9 @@ def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarr
 
 
 def _match(path: Path) -> re.Match[str]:
-    found = NAME.match(path.name)
-    assert found is not None  # recording_files gives only such names
-    return found
+    match = NAME.match(path.name)
+    assert match is not None  # recording_files gives only such names
+    return match
 
 
 def _start_s(path: Path) -> float:

@@ -376,10 +376,10 @@ def disk_warning(settings: WriterSettings) -> str:
 
 def recording_files(directory: Path, kind: str) -> list[Path]:
     """Return our files of one kind (FULL or TIER) in a folder, oldest first."""
-    found = [
+    files = [
         p for p in directory.iterdir() if (m := NAME.match(p.name)) and bool(m["kind"]) == (kind == TIER)
     ]
-    return sorted(found, key=lambda p: (NAME.match(p.name)["start"], len(p.name), p.name))  # type: ignore[index]
+    return sorted(files, key=lambda p: (NAME.match(p.name)["start"], len(p.name), p.name))  # type: ignore[index]
 
 
 def prune(directory: Path, kind: str, budget: float, keep: Path | None, at_most: int | None = None) -> int:

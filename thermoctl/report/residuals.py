@@ -19,8 +19,8 @@ def autocorrelation(e: np.ndarray, lags: int) -> np.ndarray:
     """Return the autocorrelation of e (N,) at the lags 1..lags (biased, as in Box and Jenkins)."""
     centred = e - e.mean()
     spectrum = np.abs(np.fft.rfft(centred, 2 * len(e))) ** 2
-    found = np.fft.irfft(spectrum)[: lags + 1]
-    return found[1:] / found[0]
+    correlation = np.fft.irfft(spectrum)[: lags + 1]
+    return correlation[1:] / correlation[0]
 
 
 def cumulated_periodogram(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

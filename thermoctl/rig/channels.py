@@ -197,8 +197,8 @@ class AxesChannels(Channels):
     @cached_property
     def index(self) -> dict[str, int]:
         """Return the index of each role; a shared role has its place in the first axis."""
-        found = {role: i for i, role in enumerate(self.names)}
-        return found | {role: found[f"{self.axes[0][0]}.{role}"] for role in self.shared}
+        by_role = {role: i for i, role in enumerate(self.names)}
+        return by_role | {role: by_role[f"{self.axes[0][0]}.{role}"] for role in self.shared}
 
     @cached_property
     def parts(self) -> dict[str, slice]:
@@ -240,8 +240,8 @@ def of_names(points: tuple[str, ...]) -> Channels:
 
 def of_text(text: str) -> Channels:
     """Return the channels of a text that `Channels.text` wrote."""
-    found: dict[str, dict[str, Any]] = json.loads(text)
-    return of_points(Point(name, **keys) for name, keys in found.items())
+    points: dict[str, dict[str, Any]] = json.loads(text)
+    return of_points(Point(name, **keys) for name, keys in points.items())
 
 
 def read_points(node: Node, folder: Path, shared: Iterable[Point] = ()) -> Channels:

@@ -97,17 +97,17 @@ class Sequencer:
         if now_s < self._next_s:
             return []
         self._next_s = now_s + REPEAT_S
-        found = [(_command(a), 0.0)]
+        messages = [(_command(a), 0.0)]
         if wanted:
-            found += [(m, 0.0) for m in (*a.set_up, *a.enable)]
+            messages += [(m, 0.0) for m in (*a.set_up, *a.enable)]
         else:
-            found += [(m, 0.0) for m in a.disable]
+            messages += [(m, 0.0) for m in a.disable]
             if self.state == AMP_FAULT and not enable and now_s >= self._reset_s + RESET_S:
                 self._reset_s = now_s
-                found += [(m, 0.0) for m in a.reset]
+                messages += [(m, 0.0) for m in a.reset]
         if a.state is None:
             self.state = AMP_ENABLED if wanted else AMP_DISABLED
-        return found
+        return messages
 
     def off(self) -> list[tuple[Message, float]]:
         """Return the messages that disable, in every state."""

@@ -38,11 +38,11 @@ def algorithm(name: str) -> Algorithm | None:
             xor_out=0xFF if name == "sum8-inverted" else 0,
             negated=name == "sum8-negated",
         )
-    found = _catalogue().get(ALIASES.get(name, name).upper())
-    if found is None or found._width not in _WIDTHS:
+    entry = _catalogue().get(ALIASES.get(name, name).upper())
+    if entry is None or entry._width not in _WIDTHS:
         return None
     return Algorithm(
-        "crc", found._width, found._poly, found._initvalue, found._reflect_input, found._xor_output
+        "crc", entry._width, entry._poly, entry._initvalue, entry._reflect_input, entry._xor_output
     )
 
 

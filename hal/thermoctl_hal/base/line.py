@@ -103,11 +103,11 @@ def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
 
 
 def _open_socket(path: str) -> socket.socket:
-    found = re.fullmatch(r"socket://(\[[^]]+\]|[^:/]+):(\d+)/?", path)
-    if found is None:
+    match = re.fullmatch(r"socket://(\[[^]]+\]|[^:/]+):(\d+)/?", path)
+    if match is None:
         raise HardwareError(f"port '{path}': socket://host:port was expected")
     try:
-        port = socket.create_connection((found[1].strip("[]"), int(found[2])), CONNECT_S)
+        port = socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECT_S)
         port.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         port.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         port.setblocking(False)

@@ -40,10 +40,10 @@ def can_frame(message: Message, spec: Dbc, command: float, address: int) -> tupl
     """Return a message of the DBC file as (identifier, data). command: value of the signal."""
     if not isinstance(message, CanMessage):
         raise TypeError(f"{type(message).__name__} is no CAN message")
-    found = spec.database.get_message_by_name(message.name)
-    values = {s.name: 0.0 for s in found.signals}
+    message_ = spec.database.get_message_by_name(message.name)
+    values = {s.name: 0.0 for s in message_.signals}
     values |= {name: command if value is None else value for name, value in message.values.items()}
-    return spec.can_id(message.name, address), bytes(found.encode(values, strict=False))
+    return spec.can_id(message.name, address), bytes(message_.encode(values, strict=False))
 
 
 def clipped(value: float, register: Register) -> float:

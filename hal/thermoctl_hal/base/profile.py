@@ -196,9 +196,9 @@ class Dbc(BusSpec):
 
     def can_id(self, message: str, address: int) -> int:
         """Return the identifier of a message, with bit 31 for 29 bits."""
-        found = self.database.get_message_by_name(message)
+        definition = self.database.get_message_by_name(message)
         node = address << self.node_shift if self.node_shift >= 0 else 0
-        return found.frame_id + node | (0x8000_0000 if found.is_extended_frame else 0)
+        return definition.frame_id + node | (0x8000_0000 if definition.is_extended_frame else 0)
 
     def is_j1939(self, message: str, address: int = -1) -> bool:
         """Return whether a message is received by its parameter group.
@@ -206,10 +206,10 @@ class Dbc(BusSpec):
         This applies to messages of the DBC format J1939PG, and to those of source address 254, which no
         sender has. If the binding gives an `address`, it applies to all messages with identifiers of 29
         bits."""
-        found = self.database.get_message_by_name(message)
-        if self.node_shift >= 0 or not found.is_extended_frame:
+        definition = self.database.get_message_by_name(message)
+        if self.node_shift >= 0 or not definition.is_extended_frame:
             return False
-        return found.protocol == "j1939" or found.frame_id & 0xFF == NULL_ADDRESS or address >= 0
+        return definition.protocol == "j1939" or definition.frame_id & 0xFF == NULL_ADDRESS or address >= 0
 
 
 @dataclass(frozen=True)

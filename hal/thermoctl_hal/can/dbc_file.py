@@ -88,15 +88,15 @@ def load_dbc(path: Path) -> DbcFile:
         reason = ""
     except Exception as e:  # cantools raises parse errors of several libraries
         database, reason = None, _first_line(e)
-    found = (
+    blocks = (
         _by_message(path, text, reason)
         if database is None
         else DbcFile(database, _doubled(m for m in database.messages))
     )
     if _J1939.search(text) and "VFrameFormat" not in text:
-        for message in found.database.messages:
+        for message in blocks.database.messages:
             message.protocol = "j1939"
-    return found
+    return blocks
 
 
 def _first_line(error: Exception) -> str:
@@ -137,8 +137,8 @@ def _by_message(path: Path, text: str, reason: str) -> DbcFile:
 
 def _line_of(reason: str, text: str) -> int:
     """Return the line that cantools means: by its number, else the last one with the word that it quotes."""
-    if found := _LINE.search(reason):
-        return int(found[1])
+    if match := _LINE.search(reason):
+        return int(match[1])
     word = re.search(r"'([^']+)'", reason)
     lines = [n for n, line in enumerate(text.split("\n"), 1) if word and word[1] in line]
     return lines[-1] if lines else 1
@@ -179,24 +179,24 @@ def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
             remarks.append((number, f"VAL_ {begin[1]} {begin[2]}: there is no such signal, ignored"))
         elif _FORMAT.match(line):
             attributes.append(line.strip())
-        elif found := next(filter(None, (p.match(line) for p in (_TYPE, _EXTENDED_MUX, _FORMAT_OF))), None):
-            for one in of[int(found[1])]:
+        elif match := next(filter(None, (p.match(line) for p in (_TYPE, _EXTENDED_MUX, _FORMAT_OF))), None):
+            for one in of[int(match[1])]:
                 one.more.append(line.strip())
     return blocks, attributes, remarks
 
 
 def _begun(line: int, text: str, remarks: list[tuple[int, str]]) -> _Block | None:
     """Return the message that a BO_ line begins; None where it is no message."""
-    found = _BLOCK.match(text)
-    if found is None:
+    match = _BLOCK.match(text)
+    if match is None:
         remarks.append((line, f"'{text.strip()[:40]}' is no message of the format, left out"))
-    if found is None or found[2] == NO_MESSAGE:
+    if match is None or match[2] == NO_MESSAGE:
         return None
-    is_hexadecimal = "x" in found[1].lower()
+    is_hexadecimal = "x" in match[1].lower()
     if is_hexadecimal:
-        remarks.append((line, f"{found[2]}: identifier {found[1]} in hexadecimal"))
-    number = int(found[1], 16 if is_hexadecimal else 10)
-    return _Block([(line, text)], number, found[2], found[3])
+        remarks.append((line, f"{match[2]}: identifier {match[1]} in hexadecimal"))
+    number = int(match[1], 16 if is_hexadecimal else 10)
+    return _Block([(line, text)], number, match[2], match[3])
 
 
 def _message(
@@ -245,23 +245,23 @@ def _signals(block: _Block, faults: dict[str, str], remarks: list[tuple[int, str
     """Return the signals of a message whose lines can be read."""
     signals: dict[str, _Signal] = {}
     for line, text in block.lines[1:]:
-        found, begin = _SIGNAL.match(text), _BEGINS_SIGNAL.match(text)
-        name = found["name"] if found else begin[1] if begin else text
-        scale = _scale(found["scale"]) if found else ""
+        match, begin = _SIGNAL.match(text), _BEGINS_SIGNAL.match(text)
+        name = match["name"] if match else begin[1] if begin else text
+        scale = _scale(match["scale"]) if match else ""
         if name in signals:
             _left_out(line, f"{block.name}.{name}", "a second signal of this name", faults, remarks)
-        elif found is None or not scale:
+        elif match is None or not scale:
             why = f"no signal of the format: {text.strip()[:60]}"
             _left_out(line, f"{block.name}.{name}", why, faults, remarks)
         else:
             safe = name if _NAME.fullmatch(name) else f"X_{len(signals)}_"
             if safe != name:
                 remarks.append((line, f"{block.name}.{name}: not a name of the DBC format"))
-            if not _PLAIN.fullmatch(found["scale"]):
+            if not _PLAIN.fullmatch(match["scale"]):
                 remarks.append(
-                    (line, f"{block.name}.{name}: odd numbers ({found['scale']}), read as {scale}")
+                    (line, f"{block.name}.{name}: odd numbers ({match['scale']}), read as {scale}")
                 )
-            mux, place, unit = found["mux"] or "", found["place"], found["unit"]
+            mux, place, unit = match["mux"] or "", match["place"], match["unit"]
             canonical = f' SG_ {safe} {mux} : {place} {scale} [0|0] "{unit}" Vector__XXX'
             signals[name] = _Signal(line, name, safe, canonical)
     return list(signals.values())

@@ -67,10 +67,10 @@ def _plain(text: str) -> str:
 
 def _number(text: str) -> int | None:
     """Return a number as EDS files write it: 7, 0x0007, 0007h; None for other text."""
-    found = _NUMBER.fullmatch(_plain(text))
-    if found is None:
+    match = _NUMBER.fullmatch(_plain(text))
+    if match is None:
         return None
-    return int(found[1] or found[2] or found[3], 10 if found[3] else 16)
+    return int(match[1] or match[2] or match[3], 10 if match[3] else 16)
 
 
 @while_same
@@ -99,11 +99,11 @@ def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, st
                 remarks.append((number, f"'{text[:40]}' is no comment of the format, passed over"))
             continue
         if section := _SECTION.match(text):
-            found = _OBJECT.fullmatch(section[1])
-            entry = Entry(number) if found else None
-            if found and entry:
-                item = Object(int(found[1], 16), int(found[2] or "0", 16))
-                if found[2] and not item.sub:
+            match = _OBJECT.fullmatch(section[1])
+            entry = Entry(number) if match else None
+            if match and entry:
+                item = Object(int(match[1], 16), int(match[2] or "0", 16))
+                if match[2] and not item.sub:
                     counts.setdefault(item.number, number)  # [2022sub0] counts the sub-indices of [2022]
                 elif entries.setdefault(item, entry) is not entry:
                     entries[item].again = entry

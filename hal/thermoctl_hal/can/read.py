@@ -36,13 +36,13 @@ def read_dbc(top: Section, folder: Path) -> Dbc:
     path = folder / str(k["dbc"])
     node = top.get("dbc")
     try:
-        found = load_dbc(path)
+        file = load_dbc(path)
     except OSError as e:
         raise node.error(f"dbc: {path} cannot be read: {e.strerror}") from None
     except ValueError as e:
         raise node.error(f"dbc: {path} is not a DBC file: {e}") from None
     shift = -1 if k["node_shift"] is None else k["node_shift"]
-    return Dbc(path, found.database, shift, found.faults, found.warning)
+    return Dbc(path, file.database, shift, file.faults, file.warning)
 
 
 def read_signal(s: Section, spec: BusSpec) -> DbcSource:
@@ -74,8 +74,8 @@ def _signal_of(s: Section, spec: Dbc, message: str) -> Signal:
     fault = spec.faults.get(f"{message}.{s.text('signal')}")
     if fault is not None:
         raise s.get("signal").error(f"signal: {spec.file}: {fault}")
-    found = spec.database.get_message_by_name(message)
-    return found.get_signal_by_name(named(s, "signal", [x.name for x in found.signals]))
+    definition = spec.database.get_message_by_name(message)
+    return definition.get_signal_by_name(named(s, "signal", [x.name for x in definition.signals]))
 
 
 def _raw_sentinel(node: Node, signal: Signal) -> float:

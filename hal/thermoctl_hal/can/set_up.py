@@ -74,22 +74,22 @@ class Objects:
             raise self._error(item, key, "has no sub-indices")
         if sub and sub not in subs:
             raise self._error(item, key, f"has no sub-index {sub}; it has {', '.join(map(str, subs))}")
-        found = self._file.entries[item]
-        if found.again is not None and found.again.data_type != found.data_type:
+        entry = self._file.entries[item]
+        if entry.again is not None and entry.again.data_type != entry.data_type:
             raise self._error(
                 item,
                 key,
-                f"stands twice with different types (lines {found.line}, {found.again.line}): keep one",
+                f"stands twice with different types (lines {entry.line}, {entry.again.line}): keep one",
             )
-        if found.data_type is None:
+        if entry.data_type is None:
             raise self._error(
                 item,
                 key,
-                f"(line {found.line}) has no DataType: add it to the file, as DataType=0x0004 for int32",
+                f"(line {entry.line}) has no DataType: add it to the file, as DataType=0x0004 for int32",
             )
-        letter = _FORMATS.get(found.data_type)
+        letter = _FORMATS.get(entry.data_type)
         if letter is None:
-            raise self._error(item, key, f"({found.name}) is no whole number of up to 4 bytes")
+            raise self._error(item, key, f"({entry.name}) is no whole number of up to 4 bytes")
         return letter
 
     def _error(self, item: Object, key: str, what: str) -> InputError:

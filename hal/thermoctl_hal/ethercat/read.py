@@ -160,16 +160,16 @@ def read_place(s: Section, spec: BusSpec) -> Place:
         i = take(k["invalid"], ETHERCAT["invalid of ethercat"])
         invalid = _place(k["invalid"], i, slave), Condition("", i["mask"], i["good"])
         k["invalid"].end()
-    found = _place(s, k, slave)
-    width = 8 * (found.end - found.offset)
-    if k["bits"] and (found.letter in "fd" or k["low_bit"] + k["bits"] > width):
+    place = _place(s, k, slave)
+    width = 8 * (place.end - place.offset)
+    if k["bits"] and (place.letter in "fd" or k["low_bit"] + k["bits"] > width):
         raise s.get("bits").error(f"bits: {k['low_bit']} + {k['bits']} are not inside the {width} bits of it")
     return Place(
-        found.offset,
-        found.letter,
+        place.offset,
+        place.letter,
         (k["low_bit"], k["bits"]),
         k["signed"],
-        tuple(_sentinel(n, found, k) for n in k["sentinels"] or ()),
+        tuple(_sentinel(n, place, k) for n in k["sentinels"] or ()),
         invalid,
     )
 

@@ -135,10 +135,10 @@ class Link:
                 "'max_block'"
             )
         try:
-            found = self._answers.decode(answer)
+            decoded = self._answers.decode(answer)
         except (self._invalid, struct.error, IndexError) as e:
             raise NoAnswer(f"no valid answer: {answer[:SHOWN].hex(' ')} ({e})") from None
-        return [int(b) for b in found.bits[:count]] if kind in BITS else list(found.registers)
+        return [int(b) for b in decoded.bits[:count]] if kind in BITS else list(decoded.registers)
 
     def write(self, function: int, address: int, words: list[int], unit: int, timeout_s: float) -> int:
         """Write a coil (5), a register (6) or registers (16); return 0, or the exception code.
@@ -314,14 +314,14 @@ def _has_good_crc(frame: bytes) -> bool:
 
 def _frames(data: bytes) -> tuple[list[tuple[int, int, int, bytes]], bytes]:
     """Return the TCP frames of `data` as (transaction, protocol, unit, PDU), and the bytes behind them."""
-    found = []
+    frames = []
     while len(data) > HEAD:
         transaction, protocol, length, unit = struct.unpack_from(">HHHB", data)
         if protocol or not 2 <= length <= LONGEST_PDU + 1 or len(data) < HEAD - 1 + length:
             break
-        found.append((transaction, protocol, unit, data[HEAD : HEAD - 1 + length]))
+        frames.append((transaction, protocol, unit, data[HEAD : HEAD - 1 + length]))
         data = data[HEAD - 1 + length :]
-    return found, data
+    return frames, data
 
 
 def _found_tcp(received: bytes, request: _Request) -> bytes | None:

@@ -81,13 +81,13 @@ def _axis(s: Section, bounds: Iterable[Bound], channels: Channels) -> str:
     """Return the axis that an amplifier drives: that of its roles. Raises InputError for none or several."""
     if not isinstance(channels, AxesChannels):
         return ""
-    found = {b.role.partition(".")[0] for b in bounds}
-    if len(found) != 1 or not found <= set(channels.parts):
+    axes = {b.role.partition(".")[0] for b in bounds}
+    if len(axes) != 1 or not axes <= set(channels.parts):
         raise s.node.error(
             f"roles: an amplifier has roles of the one axis that it drives, written AXIS.CHANNEL (axes: "
             f"{', '.join(channels.parts)}); found {', '.join(b.role for b in bounds) or 'none'}"
         )
-    return found.pop()
+    return axes.pop()
 
 
 def _drive_of_this_rig(s: Section, spec: Cia402, node: int) -> Cia402:
@@ -150,15 +150,15 @@ def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
                     f"({claimed[role].place}); keep one of them"
                 )
             claimed[role] = b
-    found = []
+    checked = []
     for k, b in enumerate(bindings):
         others = [o for o in bindings if o is not b and port_key(o.port) == port_key(b.port)]
         for o in others:
             if o in bindings[:k]:
                 _check_shared(o, b)
         shared = bool(others) and b.port.split(":")[0] not in FREE
-        found.append(replace(b, shared=shared, neighbours=tuple(others)))
-    return found
+        checked.append(replace(b, shared=shared, neighbours=tuple(others)))
+    return checked
 
 
 def _copies(channels: Channels, role: str) -> list[int]:
@@ -204,15 +204,15 @@ def _check_can_bus(first: Binding, second: Binding, both: str) -> None:
 
 def file_warnings(bindings: Iterable[Binding]) -> list[str]:
     """Return a line for each DBC or EDS file that was read in spite of a fault."""
-    found = []
+    lines = []
     for b in bindings:
         spec = b.profile.bus_spec
         warning = spec.warning if isinstance(spec, Dbc) else ""
         if isinstance(spec, Cia402) and spec.eds is not None:
             warning = read_eds(spec.eds).warning
-        if warning and warning not in found:
-            found.append(warning)
-    return found
+        if warning and warning not in lines:
+            lines.append(warning)
+    return lines
 
 
 def rig_notes(bindings: Iterable[Binding]) -> list[str]:

@@ -24,8 +24,8 @@ STATE = "state"  # channel of an amplifier that reports no state
 def load_profile(path: str | Path) -> Profile:
     """Read and check a profile. Raises InputError with file, line and what was expected."""
     top = Section(_parsed(Path(path)), "device profile")
-    if (found := top.text("format")) != FORMAT:
-        raise top.get("format").error(f"format: '{FORMAT}' was expected, found '{found}'")
+    if (stated := top.text("format")) != FORMAT:
+        raise top.get("format").error(f"format: '{FORMAT}' was expected, found '{stated}'")
     bus = top.text("bus", choices=BUSES)
     k = take(top, PROFILE["profile"])
     read_source: _ReadSource = part(BUSES[bus].source)

@@ -94,7 +94,7 @@ def _by_messages(s: Section, spec: BusSpec, channels: dict[str, Channel]) -> dic
         raise k["command"].error(
             "command: this message does not carry the command: put 'command' where it belongs"
         )
-    found: dict[str, Any] = {
+    messages: dict[str, Any] = {
         key: tuple(read_message(n, spec, key) for n in k[key] or ())
         for key in ("set_up", "enable", "disable", "reset")
     }
@@ -117,7 +117,7 @@ def _by_messages(s: Section, spec: BusSpec, channels: dict[str, Channel]) -> dic
             raise watchdog.error(
                 f"watchdog_s: {watchdog_s:g} s is below two periods of command_hz: the device would stop by itself"
             )
-    return found | {
+    return messages | {
         "command": command,
         "command_hz": k["command_hz"],
         "state": state,

@@ -133,10 +133,10 @@ class Board:
         Disabled, from -inf, while the loop writes and before its first command."""
         row = self.rows[device.roles[0]]
         before = int(row["command_sequence"])
-        found = float(row["command"]), bool(row["command_enable"]), float(row["command_s"])
+        command = float(row["command"]), bool(row["command_enable"]), float(row["command_s"])
         if before == 0 or before & 1 or int(row["command_sequence"]) != before:
             return 0.0, False, -math.inf
-        return found
+        return command
 
     def beat(self, roles: list[int]) -> int:
         """Return the number of posts of the device with these roles, to detect a hung poller."""

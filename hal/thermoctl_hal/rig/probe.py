@@ -106,15 +106,15 @@ class Probe:
 
     def readings(self) -> list[Reading]:
         """Return every channel, in the order of the profile."""
-        found = []
+        readings = []
         for b in self._binding.bounds:
             role = ROLE[b.role]
             value, problem = float(self.sample.value[role]), ""
             if self.sample.status[role] != OK:
                 problem = self._problem(role)
             raw = (value - b.offset) / b.scale if not math.isnan(value) else math.nan
-            found.append(Reading(b.channel.name, raw, value, b.channel.unit, problem))
-        return found
+            readings.append(Reading(b.channel.name, raw, value, b.channel.unit, problem))
+        return readings
 
     def _problem(self, role: int) -> str:
         if self.device is None:
@@ -174,11 +174,11 @@ def _registers(port: str, baud: int, unit: int) -> list[str]:
     try:
         for kind in FUNCTIONS:
             try:
-                found = link.read(kind, 0, FIRST_REGISTERS, unit, 1.0)
+                values = link.read(kind, 0, FIRST_REGISTERS, unit, 1.0)
             except NoAnswer as e:
                 lines.append(f"{kind}: {e}")
                 continue
-            shown = f"exception {found}" if isinstance(found, int) else " ".join(map(str, found))
+            shown = f"exception {values}" if isinstance(values, int) else " ".join(map(str, values))
             lines.append(f"{kind} 0..{FIRST_REGISTERS - 1}: {shown}")
     finally:
         link.close()

@@ -86,10 +86,10 @@ def read_frame(top: Section, folder: Path) -> BinaryFrame:
 
 
 def _bytes(s: Section, key: str, nodes: list[Node]) -> bytes:
-    found = bytes(integer_of(n, key, 0, 255) for n in nodes)
-    if len(found) > MAX_SYNC:
-        raise s.get(key).error(f"{key}: at most {MAX_SYNC} bytes were expected, found {len(found)}")
-    return found
+    content = bytes(integer_of(n, key, 0, 255) for n in nodes)
+    if len(content) > MAX_SYNC:
+        raise s.get(key).error(f"{key}: at most {MAX_SYNC} bytes were expected, found {len(content)}")
+    return content
 
 
 def checksum_name(s: Section) -> str:

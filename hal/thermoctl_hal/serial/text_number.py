@@ -23,11 +23,11 @@ _HEX = [sign + zeros + "A" for sign in ("", "+", "-", " ") for zeros in ("0" * n
 
 def number(text: str, base: int, decimal: str) -> float | None:
     """Return the number in `text`, or None; blanks may stand around it and after its sign."""
-    found = _NUMBER[base, decimal].match(text.strip())
-    if found is None:
+    match = _NUMBER[base, decimal].match(text.strip())
+    if match is None:
         return None
-    value = float(int(found[2], 16)) if base == 16 else float(found[2].replace(",", "."))
-    return -value if found[1] == "-" else value
+    value = float(int(match[2], 16)) if base == 16 else float(match[2].replace(",", "."))
+    return -value if match[1] == "-" else value
 
 
 def cut_short(line: str, match: re.Match[str], group: str) -> bool:

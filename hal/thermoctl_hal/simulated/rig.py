@@ -54,10 +54,10 @@ def surroundings(node: Node | None) -> dict[str, Surrounding]:
     """Read `hal.inputs`: name -> {mean, swing, period_s, noise, resolution}. Raises InputError."""
     if node is None:
         return {}
-    found = {}
+    by_name = {}
     for name, item in Section(node, "inputs").node.value.items():
         s = Section(item, name)
-        found[name] = Surrounding(
+        by_name[name] = Surrounding(
             s.number("mean"),
             s.number("swing", 0.0),
             s.number("period_s", 86400.0, 1.0),
@@ -65,7 +65,7 @@ def surroundings(node: Node | None) -> dict[str, Surrounding]:
             s.number("resolution", 0.0, 0.0),
         )
         s.end()
-    return found
+    return by_name
 
 
 class PlantRig:

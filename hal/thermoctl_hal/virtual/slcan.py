@@ -219,9 +219,9 @@ class DbcAmplifier(DbcSender):
         for message, act in self._obeyed:
             if can_id != self._spec.can_id(message.name, self.binding.address):
                 continue
-            found = self._spec.database.decode_message(message.name, data, decode_choices=False)
-            assert isinstance(found, dict)  # a message without containers
-            numbers = {n: float(v) for n, v in found.items() if isinstance(v, int | float)}
+            decoded = self._spec.database.decode_message(message.name, data, decode_choices=False)
+            assert isinstance(decoded, dict)  # a message without containers
+            numbers = {n: float(v) for n, v in decoded.items() if isinstance(v, int | float)}
             if all(v is None or numbers[n] == v for n, v in message.values.items()):
                 act(next((numbers[n] for n, v in message.values.items() if v is None), 0.0))
                 self._heard_s = now_s

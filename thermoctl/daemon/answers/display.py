@@ -76,12 +76,16 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
 
     An invalid value is '-' with its state and age.
     """
-    found = status["readings"]
+    by_role = status["readings"]
     shown_or = {
         name: number(status[name], 3)
         if status[name] is not None
         else next(
-            (shown(found[r], 3) for r in FIXED_SOURCES[name] if found[r]["state"] not in ("OK", "ABSENT")),
+            (
+                shown(by_role[r], 3)
+                for r in FIXED_SOURCES[name]
+                if by_role[r]["state"] not in ("OK", "ABSENT")
+            ),
             "-",
         )
         for name in ("position_um", "output_reference_um", "power_w")
@@ -94,18 +98,18 @@ def value_lines(status: Mapping[str, Any]) -> list[str]:
     lines = [
         f"setpoint {number(status['setpoint_um'], 3)} um   position {shown_or['position_um']} um   compensation "
         f"{number(status['compensation_um'], 3)}{mark} um   output {output}",
-        f"drive {number(status['drive'], 3)}   power {shown_or['power_w']} W   air {shown(found['air_c'])} C",
+        f"drive {number(status['drive'], 3)}   power {shown_or['power_w']} W   air {shown(by_role['air_c'])} C",
         f"{'temperature, C':20}{'measured':>9}{'estimated':>11}{'age':>9}",
     ]
     for point, estimate in status["estimates_c"].items():
-        r = found[f"{point}_c"]
+        r = by_role[f"{point}_c"]
         bad = "" if r["state"] == "OK" else f"  {r['state'].lower()}"
         lines.append(
             f"{status['labels'][point]:20}{number(r['value'], 2):>9}{number(estimate, 2):>11}{span(r['age_s']):>9}{bad}"
         )
     if mark:
         lines.append(
-            f"estimates and compensation (?): not corrected by the coil's sensor for {span(found[status['coil']]['age_s'])}"
+            f"estimates and compensation (?): not corrected by the coil's sensor for {span(by_role[status['coil']]['age_s'])}"
         )
     return lines + message_lines(status)
 

@@ -42,14 +42,14 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     The message is the device's newest one, with its time (seconds since 1970); it stays when the channel
     is valid again.
     """
-    statuses, found = shared.row.states(row)[0], {}
+    statuses, by_role = shared.row.states(row)[0], {}
     values = row[shared.row.readings]
     begin_s = row[AT["wall_s"]] - row[AT["t_s"]]
     for c, role in enumerate(shared.channels.names):
         state = verdict(int(statuses[c]), shared.areas["verdicts"][c])
         last = _or_none(values[c])
         said = shared.remarks.get(c) or (0, math.nan, "")
-        found[role] = {
+        by_role[role] = {
             "value": last if state == "OK" else None,
             "last": last,
             "state": state,
@@ -57,7 +57,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
             "message": said[2],
             "message_wall_s": _or_none(begin_s + said[1]),
         }
-    return found
+    return by_role
 
 
 def valid_signals(channels: Channels, found: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:

@@ -59,8 +59,8 @@ def status(shared: Shared) -> dict[str, Any]:
             "position_um": None,
             "compensation_um": None,
         }
-    found = readings.readings(shared, row)
-    valid, coil = readings.valid_signals(shared.channels, found), shared.channels.coil
+    by_role = readings.readings(shared, row)
+    valid, coil = readings.valid_signals(shared.channels, by_role), shared.channels.coil
     number = {
         name: float(row[i]) if math.isfinite(row[i]) and valid.get(name, True) else None
         for name, i in shared.row.index.items()
@@ -68,7 +68,7 @@ def status(shared: Shared) -> dict[str, Any]:
     estimated = not shared.counters[NO_MODEL]
     if not estimated:
         number |= dict.fromkeys(("expansion_um", *(f"{p}_est_c" for p in shared.channels.point_names)))
-    measured = found["output_reference_um"]["state"] != "ABSENT"
+    measured = by_role["output_reference_um"]["state"] != "ABSENT"
     busy = percentiles(shared.areas["busy"])
     return {
         "state": arming.STATES[int(row[AT["state"]])],
@@ -77,10 +77,10 @@ def status(shared: Shared) -> dict[str, Any]:
         "generation": int(row[AT["generation"]]),
         "uptime_s": number["t_s"],
         **{name: number[name] for name in NUMBERS},
-        "channels": {role: r["state"] for role, r in found.items()},
-        "readings": found,
+        "channels": {role: r["state"] for role, r in by_role.items()},
+        "readings": by_role,
         "output_is": MEASURED if measured else EXPECTED if estimated else UNKNOWN,
-        "estimates_state": NO_ESTIMATE if not estimated else "OK" if found[coil]["state"] == "OK" else FREE,
+        "estimates_state": NO_ESTIMATE if not estimated else "OK" if by_role[coil]["state"] == "OK" else FREE,
         "coil": coil,
         "labels": shared.channels.labels,
         "drive_code": readings.drive_code(shared, row),
@@ -96,7 +96,7 @@ def status(shared: Shared) -> dict[str, Any]:
         },
         "unsaved": unsaved(shared),
         "wall_s": number["wall_s"],
-        "faults": readings.standing_faults(shared, row, found),
+        "faults": readings.standing_faults(shared, row, by_role),
     }
 
 

@@ -60,7 +60,7 @@ def check(settings: Settings) -> int:
 def _check(settings: Settings) -> int:
     law_parameters(settings)
     model = compensator(settings)
-    found: list[tuple[bool, str]] = []
+    obstacles_: list[tuple[bool, str]] = []
     notes: list[str] = []
     with _drivers(settings):
         check_mode(settings)
@@ -71,12 +71,12 @@ def _check(settings: Settings) -> int:
                 *notes,
                 *filter(None, (origin(settings), unknown_group(settings))),
             ]
-        found = list(obstacles(settings))
+        obstacles_ = list(obstacles(settings))
         warnings = power_warning(settings), priority_warning(settings), *device_warnings(settings)
-        found += [(False, w) for w in warnings if w]
-    for in_the_way, line in found:
+        obstacles_ += [(False, w) for w in warnings if w]
+    for in_the_way, line in obstacles_:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
-    bad = any(in_the_way for in_the_way, _ in found)
+    bad = any(in_the_way for in_the_way, _ in obstacles_)
     verdict = "NOT READY, the rig could not be armed" if bad else "good"
     print(
         f"{settings.path}: {verdict}. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, "
@@ -106,11 +106,11 @@ def _drivers(settings: Settings) -> Iterator[None]:
 
 def _each_axis(settings: Settings, examine: Callable[[Settings], int]) -> int:
     """Examine every axis; return the largest exit status."""
-    found = []
+    statuses = []
     for part in settings.axes:
         print(f"axis {part.axis}:", flush=True)
-        found.append(examine(part))
-    return max(found)
+        statuses.append(examine(part))
+    return max(statuses)
 
 
 @dataclass
@@ -137,8 +137,8 @@ def doctor(settings: Settings, seconds: float = 2.0) -> int:
     backend = make_backend(settings)
     try:
         backend.open()
-        found = _read_for(backend, seconds, settings.loop.period_s, settings.channels.names)
-        bad = _print_channels(settings, backend, found, seconds)
+        counted = _read_for(backend, seconds, settings.loop.period_s, settings.channels.names)
+        bad = _print_channels(settings, backend, counted, seconds)
     except HardwareError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
         return 3
@@ -300,7 +300,7 @@ def _throttling(base: Path, burnt: float) -> Check:
     if not runtime or not period:
         return Check("real-time throttling", True, "not there", "")
     share = 1.0 if int(runtime) < 0 else int(runtime) / int(period)
-    found = (
+    running = (
         "off"
         if int(runtime) < 0
         else f"real-time tasks may take {100 * share:.0f} %, loop.spin_s burns {100 * burnt:.0f} %"
@@ -308,7 +308,7 @@ def _throttling(base: Path, burnt: float) -> Check:
     return Check(
         "real-time throttling",
         burnt < share - 0.3 or int(runtime) < 0,
-        found,
+        running,
         "sysctl -w kernel.sched_rt_runtime_us=-1 (in /etc/sysctl.d/ to keep it), or spin less (loop.spin_s)",
     )
 
@@ -343,12 +343,12 @@ def _latency_timers(settings: Settings, sys_root: str) -> Iterator[Check]:
         return
     for device in fast_devices(settings):
         port = re.sub(r"^(slcan|rtu):|@\d+$", "", device.binding.port)
-        wanted, found = device.binding.profile.line.latency_timer_ms, latency_timer_ms(port, sys_root)
-        if found is not None:
+        wanted, present = device.binding.profile.line.latency_timer_ms, latency_timer_ms(port, sys_root)
+        if present is not None:
             yield Check(
                 f"latency_timer of {device.name}",
-                found <= max(wanted, 1),
-                f"{found} ms",
+                present <= max(wanted, 1),
+                f"{present} ms",
                 f"echo 1 > {sys_root}/bus/usb-serial/devices/{os.path.basename(os.path.realpath(port))}/latency_timer "
                 "(the udev rule of `thermoctl service install` does it at every plug)",
             )

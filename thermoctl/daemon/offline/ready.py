@@ -48,12 +48,12 @@ def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
         return
     for node in settings.hal.devices:
         port = node.value.get("port")
-        if port is not None and (found := PLACEHOLDER.search(str(port.value))):
+        if port is not None and (placeholder := PLACEHOLDER.search(str(port.value))):
             yield (
                 True,
                 str(
                     port.error(
-                        f"port: '{found[0]}' stands for your own adapter; `ls /dev/serial/by-id` shows its name"
+                        f"port: '{placeholder[0]}' stands for your own adapter; `ls /dev/serial/by-id` shows its name"
                     )
                 ),
             )
@@ -113,8 +113,8 @@ def _place(settings: Settings, keys: tuple[str, ...]) -> Node:
     """Return the node of an option: the axis' own, else the rig's, else the nearest section that is there."""
     root = load(settings.path)
     own = root.value[AXES].value[settings.axis] if settings.axis else root
-    found = [_walk(start, keys) for start in (own, root)]
-    return max(found, key=lambda f: f[0])[1]
+    nodes = [_walk(start, keys) for start in (own, root)]
+    return max(nodes, key=lambda f: f[0])[1]
 
 
 def _walk(node: Node, keys: tuple[str, ...]) -> tuple[int, Node]:

@@ -42,12 +42,12 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
     Raises InputError when the metadata is missing or damaged, or ticks are missing.
     """
     try:
-        found = read_law_metadata(law_metadata)
-        law = Law(found["model"], found["parameters"], float(found["period_s"]))
-        tick = int(found["tick"])
-        if found["state"] is not None:
-            law.restore(found["state"])
-        layout = of_channels(of_names(found["model"].points))
+        metadata = read_law_metadata(law_metadata)
+        law = Law(metadata["model"], metadata["parameters"], float(metadata["period_s"]))
+        tick = int(metadata["tick"])
+        if metadata["state"] is not None:
+            law.restore(metadata["state"])
+        layout = of_channels(of_names(metadata["model"].points))
         if rows.shape[1] != len(layout):
             raise ValueError(f"rows of {rows.shape[1]} signals, expected {len(layout)}")
     except (ValueError, KeyError, TypeError, OverflowError) as e:

@@ -65,8 +65,8 @@ def device_counters(shared: Shared) -> dict[str, dict[str, int]]:
     """Return the newest counters by device: frames, errors, lost, reconnections and the driver's own."""
     for _ in range(ATTEMPTS):
         if (words := shared.device_counters.get()) is not None:
-            found: dict[str, dict[str, int]] = json.loads(np.asarray(words).tobytes())
-            return found
+            by_device: dict[str, dict[str, int]] = json.loads(np.asarray(words).tobytes())
+            return by_device
     return {}
 
 

@@ -93,25 +93,25 @@ def lacks(settings: Settings) -> list[str]:
     roles = {b.role for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds}
     electric = {"voltage_v", "current_a"} <= roles and settings.protection.resistance_ohm > 0.0
     by_resistance = electric and coil not in roles and coil not in settings.protection.required
-    found = []
+    lines = []
     if "output_reference_um" not in roles:
-        found.append(
+        lines.append(
             "no output_reference_um (second encoder): nothing proves the output's error, compensation.tune learns "
             "nothing, `thermoctl calibrate` refuses; a model from `thermoctl plant linearise` compensates "
             "(docs/how-to/without-a-second-encoder.md)"
         )
     if "air_c" not in roles:
-        found.append(
+        lines.append(
             f"no air_c: the air counts as constant, at the first reading of {coil}; the air's drift is not compensated"
         )
     if coil not in roles and by_resistance:
-        found.append(
+        lines.append(
             f"no {coil}: the coil's temperature is taken from its resistance (voltage_v, current_a, "
             f"protection.resistance_ohm) while the current is above protection.resistance_current_a "
             f"({settings.protection.resistance_current_a:g} A); in between the model alone estimates it"
         )
     elif coil not in roles:
-        found.append(
+        lines.append(
             f"no {coil}: the model alone estimates the temperatures, from rest at the air's; no reading corrects them. "
             "voltage_v, current_a and protection.resistance_ohm would make the coil's resistance its thermometer"
         )
@@ -120,7 +120,7 @@ def lacks(settings: Settings) -> list[str]:
             f"{settings.path}: compensation.model needs air_c or {coil} (or voltage_v, current_a and "
             "protection.resistance_ohm): without a temperature its estimates have no start"
         )
-    return found
+    return lines
 
 
 def check_mode(settings: Settings) -> None:
@@ -162,9 +162,9 @@ def origin(settings: Settings) -> str:
         return ""
     from thermoctl.identify.modelfile import load_calibration
 
-    found = load_calibration(settings.compensation.model)
-    sources = found.fingerprints
-    if found.figures or any(Path(name).suffix not in PLANT_FILES for name in sources):
+    calibration = load_calibration(settings.compensation.model)
+    sources = calibration.fingerprints
+    if calibration.figures or any(Path(name).suffix not in PLANT_FILES for name in sources):
         return ""
     return (
         f"no calibration stands behind the model (computed from {', '.join(sources) or 'no file'}): what it compensates is "

@@ -126,8 +126,8 @@ def _page() -> tuple[bytes, str]:
 
     def hashes(tag: str) -> str:
         """Return the policy's sources (SHA-256) of all elements `tag` of the page."""
-        found = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
-        digests = (base64.b64encode(hashlib.sha256(part.encode()).digest()).decode() for part in found)
+        elements = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
+        digests = (base64.b64encode(hashlib.sha256(part.encode()).digest()).decode() for part in elements)
         return " ".join(f"'sha256-{d}'" for d in digests)
 
     return text.encode(), (
@@ -233,14 +233,14 @@ class Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"already {MAX_STREAMS} pages are open")
         try:
             self._head(HTTPStatus.OK, "text/event-stream", None)
-            watch, seen, told = self.server.watch, -1, -math.inf
+            watch, seen, told_s = self.server.watch, -1, -math.inf
             watch.wait(0, FIRST_LOOK_S)  # without a daemon, the watcher reads the last recorded minute
             self.wfile.write(f"event: past\ndata: {_dump(list(watch.past))}\n\n".encode())
             while not watch.stopping:
                 seen, frame = watch.wait(seen, 1.0)
                 now, text = time.monotonic(), f"data: {_dump(frame)}\n\n"
-                if now - told >= 1.0:
-                    told = now
+                if now - told_s >= 1.0:
+                    told_s = now
                     slow = {
                         "latency": watch.latency(),
                         "captures": [c.summary() for c in list(watch.captures)],
@@ -278,7 +278,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def _history(self, query: Query) -> None:
         end = query.number("end", time.time())
-        found = history(
+        drawn = history(
             self.server.settings.recording.directory,
             rig_identity(self.server.settings),
             query.text("signal", "compensation_um"),
@@ -291,10 +291,10 @@ class Handler(BaseHTTPRequestHandler):
         self._json(
             {
                 "ok": True,
-                "source": found.source,
-                "files": found.files,
-                "t": _numbers(found.t, 3),
-                **{k: _numbers(getattr(found, k)) for k in ("low", "mean", "high")},
+                "source": drawn.source,
+                "files": drawn.files,
+                "t": _numbers(drawn.t, 3),
+                **{k: _numbers(getattr(drawn, k)) for k in ("low", "mean", "high")},
             }
         )
 

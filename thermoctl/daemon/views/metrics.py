@@ -42,11 +42,11 @@ def metrics(shared: Shared | None) -> str:
     ]
     if shared is None or row is None:
         return "\n".join(_lines(families)) + "\n"
-    found = readings(shared, row)
-    valid, layout = valid_signals(shared.channels, found), shared.row
+    by_role = readings(shared, row)
+    valid, layout = valid_signals(shared.channels, by_role), shared.row
     row = np.array([v if valid.get(n, True) else math.nan for n, v in zip(layout.names, row, strict=True)])
     families += [
-        *_state_families(row, found, layout),
+        *_state_families(row, by_role, layout),
         *_signal_families(row, layout),
         *_recorder_families(shared),
     ]

@@ -291,8 +291,8 @@ def recorded_past(settings: Settings) -> list[dict[str, Any]]:
     begin_s, step_s = span[1] - PAST_S, PAST_STEP_S
     columns: dict[str, dict[int, float]] = {}
     for name in ("state", *PAST):
-        found = history(folder, rig, name, begin_s, span[1] + 1.0, 610, invalid, settings.row.names)
-        columns[name] = dict(zip((found.t // step_s).astype(int).tolist(), found.mean.tolist(), strict=True))
+        drawn = history(folder, rig, name, begin_s, span[1] + 1.0, 610, invalid, settings.row.names)
+        columns[name] = dict(zip((drawn.t // step_s).astype(int).tolist(), drawn.mean.tolist(), strict=True))
     measured = any(math.isfinite(v) for v in columns["output_reference_um"].values())
     output_is = MEASURED if measured else EXPECTED if settings.compensation.model else UNKNOWN
     return [

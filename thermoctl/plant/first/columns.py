@@ -169,15 +169,15 @@ def _ascii(text: str) -> str:
 
 def _column(table: Table, name: str, stated: str) -> Column:
     unit = stated or table.units.get(name, "")
-    found = words(name)
-    kind, outside = _kind_of_name(found), _outside(found)
+    name_words = words(name)
+    kind, outside = _kind_of_name(name_words), _outside(name_words)
     if unit:
         kind = _kind_of_unit(unit, kind)
         return Column(name, kind, unit, "", outside if kind == "temperature" else 0, not stated)
-    if len(found) > 1 and (by_suffix := _SUFFIX.get(found[-1], "")) and kind not in ("setpoint",):
+    if len(name_words) > 1 and (by_suffix := _SUFFIX.get(name_words[-1], "")) and kind not in ("setpoint",):
         # thermoctl's own names, coil_c, and those of many loggers
         by_unit = _kind_of_unit(by_suffix, kind)
-        if kind in (by_unit, "", "temperature") or len(found[-1]) > 1:
+        if kind in (by_unit, "", "temperature") or len(name_words[-1]) > 1:
             doubt = f"'{name}' has no unit; {by_suffix} by the end of its name"
             return Column(name, by_unit, by_suffix, doubt, outside if by_unit == "temperature" else 0)
     values = table.columns[name][np.isfinite(table.columns[name])]
@@ -226,22 +226,22 @@ def _kind_of_unit(unit: str, by_name: str) -> str:
     if by_name == "setpoint":
         return by_name
     try:
-        found = dimension({"C": "degC", "F": "degF"}.get(unit, unit))
+        wanted = dimension({"C": "degC", "F": "degF"}.get(unit, unit))
     except ValueError:
         return ""
     if unit in ("deg", "°", "rad", "degree"):
         return "angle"
-    if not found:
+    if not wanted:
         return "duty" if by_name in ("duty", "power", "flow") else ""
-    if found == dimension("Hz"):
+    if wanted == dimension("Hz"):
         return "turning" if unit in ("rpm", "1/min", "U/min", "rad/s") or by_name == "velocity" else ""
-    if found == dimension("m"):
+    if wanted == dimension("m"):
         return "level" if by_name == "level" else "position"
-    if found == _ENERGY:
+    if wanted == _ENERGY:
         return "torque" if "N" in unit else ""
-    if found == dimension("m^3/s"):
+    if wanted == dimension("m^3/s"):
         return "flow"
-    return next((k for k, u in UNITS.items() if k != "duty" and dimension(u) == found), "")
+    return next((k for k, u in UNITS.items() if k != "duty" and dimension(u) == wanted), "")
 
 
 def quoted(text: str) -> str:
@@ -251,16 +251,16 @@ def quoted(text: str) -> str:
 
 def identifiers(columns: Sequence[str]) -> dict[str, str]:
     """Return a name of the plant language for each column."""
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     last = [re.split(r"[./]", c)[-1] for c in columns]  # sensor.room, Model/T: without what is above it
     for c, end in zip(columns, last, strict=True):
         c_short = end if re.match(r"\D", end) and last.count(end) == 1 else c
         name = re.sub(r"\W+", "_", _ascii(c_short.translate(_SPELLED)), flags=re.ASCII).strip("_") or "x"
         name = f"q_{name}" if name[0].isdigit() or name in ("t", "pi") else name
-        while name in found.values():
+        while name in names.values():
             name += "_2"
-        found[c] = name
-    return found
+        names[c] = name
+    return names
 
 
 def noise(values: np.ndarray) -> str:

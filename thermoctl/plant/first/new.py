@@ -119,13 +119,13 @@ def _named(table: Table, text: str | None) -> dict[str, str] | None:
     """Return the stated unit, or "", of each column of --inputs or --outputs. Raises InputError."""
     if text is None:
         return None
-    found = {}
+    units = {}
     for part in (p.strip() for p in text.split(",") if p.strip()):
         name, unit = (part, None) if part in table.columns else split_unit(part)
         if name not in table.columns:
             raise _no_column(table, name)
-        found[name] = unit or ""
-    return found
+        units[name] = unit or ""
+    return units
 
 
 def _outputs(
@@ -137,15 +137,15 @@ def _outputs(
     """Return the columns that may be outputs, by `named`, else by kind. Raises InputError for none."""
     kinds = ("temperature", "position", "angle", "velocity", "turning", "level")
     if named is None:
-        found = [c for c in columns.values() if c.kind in kinds and c.name not in (inputs or ())]
-        if found:
-            return found
+        outputs = [c for c in columns.values() if c.kind in kinds and c.name not in (inputs or ())]
+        if outputs:
+            return outputs
         raise InputError(
             f"{table.path}: no column is recognised as a temperature, position, velocity or level (columns "
             f"{', '.join(table.columns)}); write the units: --outputs 'COLUMN [degC]' --inputs 'COLUMN [W]', or use a "
             f"template: {', '.join(TEMPLATES)}"
         )
-    found = []
+    outputs = []
     for name in named:
         c = columns[name]
         if c.kind == "" and not c.unit and name not in (inputs or ()):
@@ -159,8 +159,8 @@ def _outputs(
                 f"{table.path}: column '{name}' is no temperature, position, velocity or level: it is taken as "
                 f"{c.kind or 'nothing known'}{f' [{c.unit}]' if c.unit else ''}; write its unit: --outputs '{name} [degC]'"
             )
-        found.append(c)
-    return found
+        outputs.append(c)
+    return outputs
 
 
 def _unclear(table: Table, c: Column, option: str, unit: str) -> InputError:
@@ -197,12 +197,12 @@ def _inputs(
 ) -> list[Column]:
     """Return the inputs, by `named`, else by kind. Raises InputError for none or a wrong kind."""
     if named is None:
-        found = [
+        drives = [
             c for c in columns.values() if c.kind in kinds and c.kind != "temperature" and c not in sensors
         ]
     else:
-        found = [columns[n] for n in named]
-        for c in found:
+        drives = [columns[n] for n in named]
+        for c in drives:
             if c.kind == "" and not c.unit:
                 raise _unclear(table, c, "--inputs", "W")
             if c.kind not in kinds:
@@ -210,11 +210,11 @@ def _inputs(
                     f"{table.path}: column '{c.name}' is taken as {c.kind or 'nothing known'}"
                     f"{f' [{c.unit}]' if c.unit else ''}; one of {', '.join(kinds)} was expected as an input"
                 )
-    if not [c for c in found if c.kind != "temperature"]:
+    if not [c for c in drives if c.kind != "temperature"]:
         rest = [c.name for c in columns.values() if c not in sensors and c.kind != "temperature"]
         raise InputError(
             f"{table.path}: no column is recognised as what {does} it: {', '.join(k for k in kinds if k != 'temperature')}"
             f"; name one with its unit, such as --inputs '{rest[0] if rest else 'COLUMN'} [{'W' if does == 'heats' else 'N'}]'"
             f" (columns {', '.join(table.columns)}), or use a template: {', '.join(TEMPLATES)}"
         )
-    return found
+    return drives

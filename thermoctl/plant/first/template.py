@@ -51,50 +51,52 @@ def mapped(
             raise InputError(
                 f"--columns {own}: template '{name}' has no such input or output{suggest(own, [r.name for r in plant.readings()])}"
             )
-    found = _assigned(plant, columns, chosen)
+    assigned = _assigned(plant, columns, chosen)
     optional = [i for i in plant.inputs.values() if i.role == "ambient" or _is_fan(i.name)]
-    lacking = [i for i in plant.inputs.values() if i.name not in found and i not in optional]
+    lacking = [i for i in plant.inputs.values() if i.name not in assigned and i not in optional]
     if lacking:
         raise InputError(
             f"{table.path}: template '{name}' reads '{lacking[0].name}' [{lacking[0].unit}]; no column is recognised as it "
             f"(columns {', '.join(table.columns)}): name it with --columns {lacking[0].name}=COLUMN"
         )
-    if not any(o in found for o in plant.outputs):
+    if not any(o in assigned for o in plant.outputs):
         wanted = ", ".join(f"{o.name} [{o.unit}]" for o in plant.outputs.values())
         raise InputError(
             f"{table.path}: no column is recognised as an output of template '{name}' ({wanted}); name one with "
             f"--columns {next(iter(plant.outputs))}=COLUMN"
         )
     for item in plant.readings():
-        if item.name in found:
-            content = _with_column(content, item, found[item.name], item.name in chosen)
+        if item.name in assigned:
+            content = _with_column(content, item, assigned[item.name], item.name in chosen)
         elif isinstance(item, Input) and item.role == "ambient":
             warm = [
-                found[o].values(table)[0]
+                assigned[o].values(table)[0]
                 for o in plant.outputs
-                if o in found and _kind(plant.outputs[o]) == "temperature"
+                if o in assigned and _kind(plant.outputs[o]) == "temperature"
             ]
             content = _fixed(content, item, min(map(float, warm)), "temperature of the air")
         elif isinstance(item, Input):
             content = _fixed(content, item, 0.0, f"no column is recognised as '{item.name}': off")
         else:
-            content = _without_output(content, item, next(o for o in plant.outputs if o in found))
-    used = {c.name for c in found.values()}
+            content = _without_output(content, item, next(o for o in plant.outputs if o in assigned))
+    used = {c.name for c in assigned.values()}
     return content, [c for c in table.columns if c not in used]
 
 
 def _assigned(plant: Plant, columns: Mapping[str, Column], chosen: Mapping[str, str]) -> dict[str, Column]:
     """Return the column of each input and output: the assignment with the largest score."""
-    found = {own: columns[c] for own, c in chosen.items()}
-    free = [c for c in columns.values() if c not in found.values()]
+    assigned = {own: columns[c] for own, c in chosen.items()}
+    free = [c for c in columns.values() if c not in assigned.values()]
     groups = dict.fromkeys((_kind(r), r.role == "ambient") for r in plant.readings())
     # The surroundings first, which are no body; drives last, since their names may repeat those of bodies.
     for group in sorted(groups, key=lambda g: (not g[1], g[0] != "temperature")):
         bodies = [
-            set(words(c.name)) for own, c in found.items() if c.kind == "temperature" and own in plant.outputs
+            set(words(c.name))
+            for own, c in assigned.items()
+            if c.kind == "temperature" and own in plant.outputs
         ]
         items = [
-            r for r in plant.readings() if r.name not in found and (_kind(r), r.role == "ambient") == group
+            r for r in plant.readings() if r.name not in assigned and (_kind(r), r.role == "ambient") == group
         ]
         fits = [c for c in free if _fits(c, *group)]
         if group[1]:  # the surroundings: the column furthest out
@@ -109,9 +111,9 @@ def _assigned(plant: Plant, columns: Mapping[str, Column], chosen: Mapping[str, 
             key=lambda p: sum(_score(r, c) + _shared(c, bodies) for r, c in zip(items, p, strict=True)),
             default=(),
         )
-        found |= {r.name: c for r, c in zip(items, best, strict=True) if c is not None}
-        free = [c for c in free if c not in found.values()]
-    return found
+        assigned |= {r.name: c for r, c in zip(items, best, strict=True) if c is not None}
+        free = [c for c in free if c not in assigned.values()]
+    return assigned
 
 
 def _kind(item: Input | Output) -> str:
@@ -183,8 +185,8 @@ def _without_output(content: str, item: Output, other: str) -> str:
 
 def _line(content: str, name: str, holds: str = "") -> re.Match[str]:
     """Return the match of an item's line: up to the closing brace, the brace, the comment."""
-    found = re.search(
+    match = re.search(
         rf"^(  {re.escape(name)}: \{{{holds}[^\n]*?)(\}})([ ]*(?:#[^\n]*)?)$", content, re.MULTILINE
     )
-    assert found is not None
-    return found
+    assert match is not None
+    return match

@@ -118,13 +118,13 @@ def unknown(name: str, unit: str, what: str) -> str:
 
 def _heat(table: Table, c: Column, ids: Mapping[str, str], drives: Sequence[Column]) -> _Heat:
     values, name = c.values(table), ids[c.name]
-    alike = sum(d.kind == c.kind for d in drives) > 1
-    own = f"_{name}" if alike else ""
+    several = sum(d.kind == c.kind for d in drives) > 1
+    own = f"_{name}" if several else ""
     currents = [d for d in drives if d.kind == "current"]
     if c.kind == "current":
         voltage = next((d for d in drives if d.kind == "voltage"), None)
         size = values**2
-        if voltage is not None and not alike:
+        if voltage is not None and not several:
             u = voltage.values(table)
             r = float(np.sum(u * values) / max(float(np.sum(size)), 1e-12))
             line = f"  R: {{value: {r:.3g}, unit: ohm}}  # confirm: '{voltage.name}' over '{c.name}'; of a motor, at rest"
@@ -134,7 +134,7 @@ def _heat(table: Table, c: Column, ids: Mapping[str, str], drives: Sequence[Colu
         )
         return _Heat(c, f"R{own} * {name}**2", line, size, False)
     if c.kind == "voltage":
-        if len(currents) == 1 and not alike:
+        if len(currents) == 1 and not several:
             return _Heat(c, "", "", values, True)  # the power of the heater is that of its current
         line = unknown(f"R{own}", "ohm", f"resistance that '{c.name}' heats, measured")
         return _Heat(c, f"{name}**2 / R{own}", line, values**2, False)
@@ -165,12 +165,12 @@ def _sizes_of_bodies(
 ) -> dict[str, tuple[float, float]]:
     """Return capacity and conductance by sensor: of all bodies together, or of one with a heat of its own."""
     every = _sizes(t, [h.size for h in heats], list(readings.values()), air)
-    found = dict.fromkeys(readings, every)
+    sizes = dict.fromkeys(readings, every)
     if len(set(heated)) > 1:
         for sensor in set(heated):
             own = [h.size for h, s in zip(heats, heated, strict=True) if s == sensor]
-            found[sensor] = _sizes(t, own, [readings[sensor]], air)
-    return found
+            sizes[sensor] = _sizes(t, own, [readings[sensor]], air)
+    return sizes
 
 
 def _sizes(

@@ -116,16 +116,16 @@ def fit(
     failure: SimulationError | None = None
     for z in [z0, *_random_starts(problem, z0, tries, seed)]:
         try:
-            found = _follow(problem, z, limits, best)
+            followed = _follow(problem, z, limits, best)
         except SimulationError as e:
             failure = failure or e
             continue
-        if found is None:
+        if followed is None:
             continue
-        if best is None or found.cost < best.cost - 1e-6:
-            best = found
+        if best is None or followed.cost < best.cost - 1e-6:
+            best = followed
         if progress:
-            progress(f"cost {found.cost:.1f} after {found.iterations} iterations")
+            progress(f"cost {followed.cost:.1f} after {followed.iterations} iterations")
     if best is None:
         raise failure or SimulationError("the plant cannot be simulated")
     return best
@@ -154,11 +154,11 @@ def _follow(problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None) 
         if squares > PREVIEW_SHARE * _sum_of_squares(problem, best.residuals):
             return None
     for _ in range(RELIMITS):
-        found = _descend(problem, z, limits)
-        z = found.z
-        if not problem.set_outlier_limits(found.residuals):
+        descended = _descend(problem, z, limits)
+        z = descended.z
+        if not problem.set_outlier_limits(descended.residuals):
             break
-    return found
+    return descended
 
 
 def _sum_of_squares(problem: Problem, residuals: Sequence[np.ndarray]) -> float:
@@ -187,17 +187,17 @@ class _Misfit:
     def look(self, z: np.ndarray, slopes: bool) -> Spot[Found]:
         """Evaluate the cost."""
         rows: list[ResidualRows] = []
-        found = self.problem.evaluate(z, slopes, rows)
-        return Spot(z, -0.5 * found.cost, (found, rows if slopes else None))
+        evaluation = self.problem.evaluate(z, slopes, rows)
+        return Spot(z, -0.5 * evaluation.cost, (evaluation, rows if slopes else None))
 
     def stand(self, spot: Spot[Found]) -> tuple[np.ndarray, np.ndarray]:
         """Return half the cost's negative gradient, and the Gauss-Newton matrix."""
-        found, rows = spot.found
+        evaluation, rows = spot.found
         if rows is None:
-            found, rows = self.look(spot.z, True).found
+            evaluation, rows = self.look(spot.z, True).found
         self.rows = rows or []
         self.problem.keep()
-        return found.gradient, found.matrix
+        return evaluation.gradient, evaluation.matrix
 
     def bend(self, spot: Spot[Found], step: np.ndarray) -> np.ndarray:
         """Return zeros where the sensitivities of all recordings are too many to be kept."""

@@ -233,17 +233,19 @@ def _opened(path: Path, changed: int) -> Fmu:
 def _description(path: Path) -> ModelDescription:
     fmpy = load("fmpy", path)
     try:
-        found = fmpy.read_model_description(str(path), validate=False)
+        description = fmpy.read_model_description(str(path), validate=False)
     except Exception as e:  # FMPy raises bare Exceptions
         raise InputError(f"{path}: no usable FMU: {' '.join(str(e).split())[:300]}") from None
-    if found.fmiVersion[0] not in "23":
-        raise InputError(f"{path}: FMI {found.fmiVersion}; FMI 2.0 or 3.0 was expected; export it anew")
-    if found.modelExchange is None:
-        other = ", found one of co-simulation only, whose inside nobody can ask" * bool(found.coSimulation)
+    if description.fmiVersion[0] not in "23":
+        raise InputError(f"{path}: FMI {description.fmiVersion}; FMI 2.0 or 3.0 was expected; export it anew")
+    if description.modelExchange is None:
+        other = ", found one of co-simulation only, whose inside nobody can ask" * bool(
+            description.coSimulation
+        )
         raise InputError(
             f"{path}: an FMU of model exchange was expected{other}; export it for model exchange"
         )
-    return found
+    return description
 
 
 def _extracted(path: Path, d: ModelDescription) -> str:
@@ -298,25 +300,25 @@ def _instance(path: Path, d: ModelDescription) -> Any:
     folder = _extracted(path, d)
     model = fmpy.fmi2.FMU2Model if d.fmiVersion[0] == "2" else fmpy.fmi3.FMU3Model
     try:
-        found = model(
+        instance = model(
             guid=d.guid,
             unzipDirectory=folder,
             modelIdentifier=d.modelExchange.modelIdentifier,
             instanceName="thermoctl",
         )
-        found.instantiate()
+        instance.instantiate()
         if d.fmiVersion[0] == "2":
-            found.setupExperiment(startTime=0.0)
-        found.enterInitializationMode()
-        found.exitInitializationMode()
-        update = found.newDiscreteStates if d.fmiVersion[0] == "2" else found.updateDiscreteStates
+            instance.setupExperiment(startTime=0.0)
+        instance.enterInitializationMode()
+        instance.exitInitializationMode()
+        update = instance.newDiscreteStates if d.fmiVersion[0] == "2" else instance.updateDiscreteStates
         for _ in range(100):
             if not update()[0]:
                 break
-        found.enterContinuousTimeMode()
+        instance.enterContinuousTimeMode()
     except Exception as e:
         raise InputError(f"{path}: cannot be started: {' '.join(str(e).split())[:300]}") from None
-    return found
+    return instance
 
 
 @cache

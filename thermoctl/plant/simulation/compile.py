@@ -165,14 +165,14 @@ def machine_code(plant: Plant, active: tuple[str, ...], stepper: bool = False) -
     `stepper`: with the functions that advance by one period, which take a fifth of the compiler's time."""
     identity = hashlib.sha256(repr((active, stepper, _structure(plant))).encode()).hexdigest()
     with _LOCK:
-        found = _LOADED.get(identity)
-    if found is None:
-        found = Code(plant, active, stepper)
+        code = _LOADED.get(identity)
+    if code is None:
+        code = Code(plant, active, stepper)
         with _LOCK:
-            _LOADED[identity] = found
+            _LOADED[identity] = code
             if len(_LOADED) > 256:
                 _LOADED.pop(next(iter(_LOADED)))
-    return found
+    return code
 
 
 def _structure(plant: Plant) -> Mapping[str, object]:

@@ -163,10 +163,10 @@ def read(name: str, cells: Cells, unit: str | None) -> Seconds:
         if not there.any():
             raise ClockError(0, "the time is missing; a finite number or a date was expected")
         if unit is None and (digits := _digits(cells[there])) is not None:
-            found = clock.from_texts(pa.array(digits))
+            seconds = clock.from_texts(pa.array(digits))
             t = np.full(len(cells), np.nan)
-            t[there] = found.t
-            return replace(found, t=t)
+            t[there] = seconds.t
+            return replace(seconds, t=t)
         return clock.from_numbers(cells, unit_of_time(name, unit), named(name) > 0)
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
@@ -213,17 +213,17 @@ def candidates(sheet: Sheet, refused: list[ClockError]) -> Iterator[Clock]:
     """Yield every column, and every pair of a date and a time of day, that can be a clock.
 
     `refused` collects what is wrong with columns of dates that are none."""
-    found: dict[str, Seconds] = {}
+    by_column: dict[str, Seconds] = {}
     for name, cells in sheet.columns.items():
         try:
             filled = cells if isinstance(cells, np.ndarray) else pc.fill_null(cells, "")
-            found[name] = read(name, _complete(filled), sheet.units.get(name))
+            by_column[name] = read(name, _complete(filled), sheet.units.get(name))
         except ClockError as e:
             if not isinstance(cells, np.ndarray) or named(name) > 0:
                 refused.append(ClockError(e.row, f"column '{name.strip()}': {e.reason}"))
-    for position, (name, seconds) in enumerate(found.items()):
+    for position, (name, seconds) in enumerate(by_column.items()):
         yield _judged(sheet, (name,), seconds, position)
-    yield from _joined(sheet, found)
+    yield from _joined(sheet, by_column)
     if sheet.step_s is not None:
         t = sheet.offset_s + sheet.step_s * np.arange(len(sheet))
         yield Clock(
@@ -295,8 +295,8 @@ def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
             )
             whole = replace(seconds, t=t, start=start, note=seconds.note + " and milliseconds")
             yield _judged(sheet, (*columns, names[after]), whole, names.index(columns[0])).plus(2 * JOINED)
-    if (found := _of_parts(sheet)) is not None:
-        yield _judged(sheet, *found, 0).plus(2 * JOINED)
+    if (parts := _of_parts(sheet)) is not None:
+        yield _judged(sheet, *parts, 0).plus(2 * JOINED)
 
 
 def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
@@ -397,11 +397,11 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
         return [(best, [n for n in names if n not in best.columns])]
     every = sorted((best, *others), key=lambda c: names.index(c.columns[0]))
     begins = [names.index(c.columns[0]) for c in every] + [len(names)]
-    found = []
+    chosen = []
     for k, c in enumerate(every):
         mine = names[begins[k] : begins[k + 1]] + (names[: begins[0]] if k == 0 else [])
-        found.append((c, [n for n in mine if n not in c.columns]))
-    return found
+        chosen.append((c, [n for n in mine if n not in c.columns]))
+    return chosen
 
 
 def _says_it(clock: Clock, stated: Clock) -> bool:
@@ -419,17 +419,17 @@ def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:
     """Return other clocks whose names differ only by a number, and whose times and columns differ."""
     names = list(sheet.columns)
     taken = set(best.columns)
-    found: list[Clock] = []
+    rivals: list[Clock] = []
     for other in others:
         (name, *more) = other.columns or ("",)
         if more or not name or taken & {name} or other.counter:
             continue
-        alike = _stem(name) == _stem(best.columns[0]) if best.columns else False
+        same_name = _stem(name) == _stem(best.columns[0]) if best.columns else False
         after = names.index(name) + 1
-        alone = after >= len(names) or any(names[after] in c.columns for c in (best, *found))
+        alone = after >= len(names) or any(names[after] in c.columns for c in (best, *rivals))
         n = min(len(other.seconds.t), len(best.seconds.t))
         same = np.array_equal(other.seconds.t[:n], best.seconds.t[:n], equal_nan=True)
-        if alike and other.seconds.kind == best.seconds.kind and not alone and not same:
-            found.append(other)
+        if same_name and other.seconds.kind == best.seconds.kind and not alone and not same:
+            rivals.append(other)
             taken.add(name)
-    return found
+    return rivals

@@ -115,8 +115,8 @@ def numbers(
         if "open" in only and set(only) <= {"open", "", "unavailable", "unknown"}:
             return _switched(name, tidy, ("open", "closed"))
         return Numbers(np.full(len(texts), np.nan), None, note)
-    if (found := _pair(name, tidy, filled)) is not None:
-        return found
+    if (paired := _pair(name, tidy, filled)) is not None:
+        return paired
     empty = missing.to_numpy(zero_copy_only=False)
     plain = pc.fill_null(pc.match_substring_regex(tidy, _PLAIN), False).to_numpy(zero_copy_only=False)
     if (plain | empty).all() and decimal != ",":
@@ -158,8 +158,8 @@ def _floats(texts: pa.Array, missing: pa.Array) -> np.ndarray:
 
 def _refuse(name: str, tidy: pa.Array, wrong: np.ndarray, count: int) -> None:
     """Raise CellError for words among numbers; return for a column of remarks."""
-    told = pc.unique(tidy.filter(pa.array(wrong))).to_pylist()
-    if count == 0 or (len(told) > FEW_WORDS and count <= wrong.sum()):
+    words_ = pc.unique(tidy.filter(pa.array(wrong))).to_pylist()
+    if count == 0 or (len(words_) > FEW_WORDS and count <= wrong.sum()):
         return
     row = int(wrong.argmax())
     text = tidy[row].as_py()[:40]

@@ -215,10 +215,12 @@ def from_texts(texts: pa.Array) -> Seconds:
     ns, order = _dated(field, clock)
     timed = bool(pc.any(pc.not_equal(field["h"], "")).as_py())
     zone = field["z"][0].as_py()
-    found = _since(ns, order, bool(zone) and (zone[0] in "+-" or zone.lower() in ("z", "utc", "gmt")), timed)
+    seconds = _since(
+        ns, order, bool(zone) and (zone[0] in "+-" or zone.lower() in ("z", "utc", "gmt")), timed
+    )
     if zone and zone.lower() not in ("z", "utc", "gmt") and zone[0] not in "+-":
-        found = replace(found, note=f"{found.note} (zone {zone})")
-    return found
+        seconds = replace(seconds, note=f"{seconds.note} (zone {zone})")
+    return seconds
 
 
 def _fields(tidy: pa.Array) -> dict[str, pa.Array]:
@@ -305,35 +307,35 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, s
             orders["year/month/day"] = (a + 2000, b, c)
         if named:
             orders = {"day.month.year": (year, b, a)}
-    found = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
-    if not found:
+    by_order = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
+    if not by_order:
         raise ClockError(0, "no date: a month of 1 to 12 and a day of 1 to 31 were expected")
-    if "year/month/day" in found and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
+    if "year/month/day" in by_order and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
         prefer = ["year/month/day", *orders]
     else:
         prefer = ["month/day/year", *orders] if pc.any(pc.not_equal(field["p"], "")).as_py() else list(orders)
-    return _one_order(found, prefer)
+    return _one_order(by_order, prefer)
 
 
-def _one_order(found: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
+def _one_order(orders_: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
     """Return the order of day and month that runs forward, evenly; any if all give the same seconds."""
-    if len(found) > 1:
-        forward = {k: ns for k, ns in found.items() if (np.diff(ns) >= 0).all()}
-        found = forward or found
-    if len({(ns - ns[0]).tobytes() for ns in found.values()}) == 1 < len(found):
-        order = next(o for o in prefer if o in found)
-        return found[order], order + " (or another order: the seconds are the same)"
-    if len(found) > 1:  # steps of a second in one order are months in the other
+    if len(orders_) > 1:
+        forward = {k: ns for k, ns in orders_.items() if (np.diff(ns) >= 0).all()}
+        orders_ = forward or orders_
+    if len({(ns - ns[0]).tobytes() for ns in orders_.values()}) == 1 < len(orders_):
+        order = next(o for o in prefer if o in orders_)
+        return orders_[order], order + " (or another order: the seconds are the same)"
+    if len(orders_) > 1:  # steps of a second in one order are months in the other
         even, uneven = {}, 0
-        for order, ns in found.items():
+        for order, ns in orders_.items():
             steps = np.diff(ns)
             if len(steps) > 1 and steps.max() <= 3 * np.sort(steps)[(len(steps) - 1) // 2]:
                 even[order] = ns
             uneven += len(steps) > 1 and steps.max() > 20 * max(steps.min(), 1)
-        if len(even) != 1 or uneven != len(found) - 1:
+        if len(even) != 1 or uneven != len(orders_) - 1:
             raise ClockError(0, "day and month cannot be told apart; write the dates as 2026-03-14")
-        found = even
-    ((order, ns),) = found.items()
+        orders_ = even
+    ((order, ns),) = orders_.items()
     return ns, order
 
 

@@ -283,8 +283,8 @@ def _header(
         return paired
     lines_of = [(n, c) for n, c in head if _fits(c, width, data)][-HEAD_LINES:]
     if not lines_of or (lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1):
-        found = _commented(comments, separator, width, head)
-        lines_of = [found] if found else lines_of
+        commented = _commented(comments, separator, width, head)
+        lines_of = [commented] if commented else lines_of
     if not lines_of:
         notes.append("no header: the columns are called column_1, column_2 ...")
         return tuple(f"column_{i + 1}" for i in range(width)), {}, (), set()
@@ -377,17 +377,17 @@ def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list
 
 def _distinct(path: Path, line: int, names: list[str], data: list[list[str]]) -> list[str]:
     """Return names that differ: an index without a name is one blank; a clock may stand twice."""
-    found: list[str] = []
+    distinct: list[str] = []
     for i, name in enumerate(names):
         if not name:
-            found.append(" " if i == 0 else f"\0{i}")
-        elif name in found and named(name) <= 0 and not is_generic(name) and any(row[i] for row in data):
+            distinct.append(" " if i == 0 else f"\0{i}")
+        elif name in distinct and named(name) <= 0 and not is_generic(name) and any(row[i] for row in data):
             raise InputError(f"{path}:{line}: the column '{name}' stands twice in the header; rename one")
-        elif name in found:
-            found.append(f"{name}\0{i}")
+        elif name in distinct:
+            distinct.append(f"{name}\0{i}")
         else:
-            found.append(name)
-    return found
+            distinct.append(name)
+    return distinct
 
 
 def _is_remarks(cells: list[str]) -> bool:
@@ -413,7 +413,7 @@ def _commented(
 
 def _facts(above: list[tuple[int, str]], separator: str) -> dict[str, list[str]]:
     """Return the statements of the lines above the header: `Delta_X <tab> 0.1`, `Interval: 0.5 s`."""
-    found: dict[str, list[str]] = {}
+    facts: dict[str, list[str]] = {}
     for _, line in above:
         cells = [
             c.strip().strip('"')
@@ -424,8 +424,8 @@ def _facts(above: list[tuple[int, str]], separator: str) -> dict[str, list[str]]
         elif len(cells) > 1 and cells[0].endswith((":", "=")):
             cells[0] = cells[0][:-1].strip()
         if len(cells) > 1 and cells[0]:
-            found.setdefault(cells[0].lower(), cells[1:])
-    return found
+            facts.setdefault(cells[0].lower(), cells[1:])
+    return facts
 
 
 def _below(cells: list[str], row: list[str], facts: dict[str, list[str]]) -> None:

@@ -40,7 +40,7 @@ def _timed(
     """Return sheets of the channels (name, unit, times (n,), values (n,), start), one a clock.
 
     A channel of arrays or objects, or one whose length is not that of its times, is left out with a note."""
-    found: dict[tuple[int, bytes, str | None], Sheet] = {}
+    sheets: dict[tuple[int, bytes, str | None], Sheet] = {}
     names = [c[0] for c in channels]
     for name, unit, t, values, start in channels:
         if values.dtype.kind in "SO" and values.ndim == 1:
@@ -67,15 +67,15 @@ def _timed(
             )
         key = (len(t), np.ascontiguousarray(t).tobytes(), start)
         seconds = Seconds(np.asarray(t, float), start, "", "unit")
-        sheet = found.setdefault(key, Sheet({}, _row_of(path), clock=seconds, start=start))
-        if names.count(name) > 1 and name in [n for s in found.values() for n in s.columns]:
+        sheet = sheets.setdefault(key, Sheet({}, _row_of(path), clock=seconds, start=start))
+        if names.count(name) > 1 and name in [n for s in sheets.values() for n in s.columns]:
             raise InputError(
                 f"{path}: two channels are called '{name}'; export them under names of their own"
             )
         sheet.columns[name] = values
         if stated := spelled(unit, name):
             sheet.units[name] = stated
-    return list(found.values())
+    return list(sheets.values())
 
 
 def _row_of(path: Path) -> Callable[[int], str]:
@@ -86,7 +86,7 @@ def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
     """Read the channels of an ASAM MDF file (3 or 4), a sheet for each clock. Raises InputError."""
     asammdf = load("asammdf", path)
     path.stat()
-    found = []
+    channels = []
     try:
         with asammdf.MDF(str(path)) as mdf:
             begins = mdf.header.start_time
@@ -97,23 +97,23 @@ def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
                 if invalid is not None and samples.dtype.kind in "fiub":
                     samples = np.where(np.asarray(invalid, bool), np.nan, samples)
                 if signal.name not in ("t", "time"):
-                    found.append(
+                    channels.append(
                         (signal.name, signal.unit or "", np.asarray(signal.timestamps), samples, start)
                     )
     except Exception as e:  # asammdf raises any error on damaged bytes
         raise _damaged(path, "MDF", e) from None
-    return _timed(path, _own_names(found), notes)
+    return _timed(path, _own_names(channels), notes)
 
 
 def _own_names(channels: list[Any]) -> list[Any]:
     """Return channels with a number behind each name that several groups use."""
     names = [c[0] for c in channels]
     seen: dict[str, int] = {}
-    found = []
+    renamed = []
     for name, *rest in channels:
         seen[name] = seen.get(name, 0) + 1
-        found.append((f"{name}_{seen[name]}" if names.count(name) > 1 else name, *rest))
-    return found
+        renamed.append((f"{name}_{seen[name]}" if names.count(name) > 1 else name, *rest))
+    return renamed
 
 
 def read_tdms(path: Path, notes: list[str], group: str | None = None) -> list[Sheet]:
@@ -148,17 +148,17 @@ def read_tdms(path: Path, notes: list[str], group: str | None = None) -> list[Sh
             else:
                 rest[own] = values, str(properties.get("unit_string", ""))
         tables.append(_group(path, title, rest, notes))
-    found = _timed(path, waves, notes)
+    sheets = _timed(path, waves, notes)
     for table in tables:
-        if found and not any(isinstance(c, np.ndarray) for c in table.columns.values()):
+        if sheets and not any(isinstance(c, np.ndarray) for c in table.columns.values()):
             notes += (
                 [f"channels of text without times left out: {', '.join(table.columns)}"]
                 if table.columns
                 else []
             )
         elif table.columns:
-            found.append(table)
-    return found
+            sheets.append(table)
+    return sheets
 
 
 def _group(path: Path, title: str, channels: dict[str, tuple[np.ndarray, str]], notes: list[str]) -> Sheet:
@@ -192,7 +192,7 @@ def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
     """Return the sheets of an Excel file, or the named one, as comma-separated text. Raises InputError."""
     openpyxl = load("openpyxl", path)
     path.stat()
-    found = []
+    sheets = []
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         titles = [w.title for w in book.worksheets]
@@ -201,11 +201,11 @@ def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
             writer = csv.writer(out, lineterminator="\n")
             for row in page.iter_rows(values_only=True) if sheet in (None, page.title) else ():
                 writer.writerow([_cell(c) for c in row])
-            found.append((page.title, out.getvalue().encode()))
+            sheets.append((page.title, out.getvalue().encode()))
         book.close()
     except Exception as e:  # openpyxl likewise
         raise _damaged(path, "Excel", e) from None
-    return found if sheet is None else [f for f in found if f[0] == _chosen(path, sheet, titles, "sheet")]
+    return sheets if sheet is None else [f for f in sheets if f[0] == _chosen(path, sheet, titles, "sheet")]
 
 
 def _cell(value: object) -> str:
@@ -227,46 +227,46 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
     content = {k: v for k, v in content.items() if not k.startswith("__")}
     if variable is not None:
         content = {variable: content[_chosen(path, variable, list(content), "variable")]}
-    found: list[Sheet] = []
+    sheets: list[Sheet] = []
     loose: dict[str, np.ndarray] = {}
     for name, value in content.items():
         if hasattr(value, "columns"):  # a data frame
             columns: dict[str, Cells] = {str(c): _column(np.asarray(value[c])) for c in value.columns}
             if value.index.dtype.kind in "mM":
                 columns = {str(value.index.name or "Time"): np.asarray(value.index), **columns}
-            found.append(Sheet(columns, _row_of(path), name=name))
+            sheets.append(Sheet(columns, _row_of(path), name=name))
         elif len(columns := _vectors(value)) > 1:
-            found.append(Sheet(columns, _row_of(path), name=name))
+            sheets.append(Sheet(columns, _row_of(path), name=name))
         elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
             loose[name] = np.squeeze(value).astype(float)
-    found += _of_vectors(path, loose) or ([] if found else _of_matrices(path, loose))
-    if len(found) > 1:
-        found.sort(key=len, reverse=True)
-        read = found[0].name or ", ".join(found[0].columns)
+    sheets += _of_vectors(path, loose) or ([] if sheets else _of_matrices(path, loose))
+    if len(sheets) > 1:
+        sheets.sort(key=len, reverse=True)
+        read = sheets[0].name or ", ".join(sheets[0].columns)
         notes.append(f"'{read}' read, of {', '.join(content)} (another: --sheet VARIABLE)")
-    return found[:1]
+    return sheets[:1]
 
 
 def _of_vectors(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
     """Return vectors of one length as tables."""
-    found = []
+    sheets = []
     for size in {len(v) for v in loose.values() if v.ndim == 1}:
         columns: dict[str, Cells] = {n: v for n, v in loose.items() if v.ndim == 1 and len(v) == size}
         if len(columns) > 1:
-            found.append(Sheet(columns, _row_of(path)))
-    return found
+            sheets.append(Sheet(columns, _row_of(path)))
+    return sheets
 
 
 def _of_matrices(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
     """Return matrices as tables, the longer side as rows."""
-    found = []
+    sheets = []
     for name, matrix in loose.items():
         if matrix.ndim == 2:  # noqa: PLR2004
             tall = matrix.T if matrix.shape[0] < matrix.shape[1] else matrix
-            found.append(
+            sheets.append(
                 Sheet({f"column_{i + 1}": c for i, c in enumerate(tall.T)}, _row_of(path), name=name)
             )
-    return found
+    return sheets
 
 
 def _vectors(value: Any) -> dict[str, Cells]:
@@ -281,18 +281,18 @@ def _vectors(value: Any) -> dict[str, Cells]:
         and "Data" in (fields["X"].dtype.names or ())
         and fields["Y"].dtype.names
     ):
-        found = {"time": np.ravel(fields["X"].reshape(-1)[0]["Data"]).astype(float)}
+        vectors = {"time": np.ravel(fields["X"].reshape(-1)[0]["Data"]).astype(float)}
         for y in fields["Y"].reshape(-1):
             name = str(np.ravel(y["Name"])[0]).strip('"').rpartition("/")[2]
-            found[name] = np.ravel(y["Data"]).astype(float)
+            vectors[name] = np.ravel(y["Data"]).astype(float)
     else:
-        found = {
+        vectors = {
             n: np.ravel(v).astype(float)
             for n, v in fields.items()
             if isinstance(v, np.ndarray) and v.dtype.kind in "fiub" and v.size > 1 and v.size == max(v.shape)
         }
-    rows = len(next(iter(found.values()), ()))
-    return dict(found) if all(len(v) == rows for v in found.values()) else {}
+    rows = len(next(iter(vectors.values()), ()))
+    return dict(vectors) if all(len(v) == rows for v in vectors.values()) else {}
 
 
 def read_arrow(path: Path, arrow: pa.Table) -> Sheet:

@@ -41,8 +41,8 @@ def special(path: Path, text: bytes) -> list[Sheet] | None:
     """Return the sheets of a text that is no table of rows; None for a table. Raises InputError."""
     lead = text[:LEAD].decode("utf-8", errors="ignore")
     for looks, reader in _LAYOUTS:
-        if looks.search(lead) and (found := reader(path, text.decode("utf-8"))) is not None:
-            return found
+        if looks.search(lead) and (sheets := reader(path, text.decode("utf-8"))) is not None:
+            return sheets
     return None
 
 
@@ -66,13 +66,13 @@ def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record's values; those of a record inside it are called `outer_inner`."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, dict):
-            found |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
+            values |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
         elif not isinstance(value, list):
-            found[key] = value
-    return found
+            values[key] = value
+    return values
 
 
 def _json(path: Path, text: str) -> list[Sheet] | None:
@@ -95,8 +95,8 @@ def _of_json(path: Path, content: Any) -> list[Sheet] | None:
     if not isinstance(content, dict):
         return None
     for reader in (_thingspeak, _series, _temperature_store):
-        if found := reader(path, content):
-            return found
+        if sheets := reader(path, content):
+            return sheets
     vectors = {
         k: v for k, v in content.items() if isinstance(v, list) and v and not isinstance(v[0], dict | list)
     }
@@ -110,8 +110,8 @@ def _of_json(path: Path, content: Any) -> list[Sheet] | None:
 
 def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
     if content and all(isinstance(x, dict) for x in content):
-        found = [s for x in content for s in _series(path, x) or ()]
-        return found or [_records(path, content)]
+        series = [s for x in content for s in _series(path, x) or ()]
+        return series or [_records(path, content)]
     lists = all(isinstance(x, list) and x and all(isinstance(y, dict) for y in x) for x in content)
     if content and lists:  # Home Assistant: a list for each entity
         return [_records(path, [{**_identity(x[0]), **y} for x in content for y in x])]
@@ -194,7 +194,7 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
     rows = [(n, x) for n, x in enumerate(text.splitlines(), 1) if x.strip() and not x.startswith("#")]
     if not rows or not (match := _POINT.match(rows[0][1])) or "=" not in match["fields"] or not match["time"]:
         return None
-    found: dict[str, dict[str, list[Any]]] = {}
+    by_measurement: dict[str, dict[str, list[Any]]] = {}
     places: dict[str, list[int]] = {}
     series: set[str] = set()
     parsed = []
@@ -206,7 +206,7 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
         parsed.append((number, match["head"], fields, match["time"]))
         series.add(match["head"])
     for number, head, fields, time in parsed:
-        table = found.setdefault(head, {"time": []})
+        table = by_measurement.setdefault(head, {"time": []})
         places.setdefault(head, []).append(number)
         count = len(table["time"])
         table["time"].append(time)
@@ -216,7 +216,7 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
         for column in table.values():
             column.extend([None] * (count + 1 - len(column)))
     sheets = []
-    for head, table in found.items():
+    for head, table in by_measurement.items():
         tags = "_".join(part.partition("=")[2] for part in head.split(",")[1:]) or head
         named = {k if k == "time" or len(series) == 1 else f"{tags}_{k}": v for k, v in table.items()}
         numbers = places[head]
@@ -226,11 +226,11 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
 
 def _klipper(path: Path, text: str) -> list[Sheet] | None:
     """Read the lines `Stats 123.4: heater_bed: target=60 temp=59.9 pwm=0.4 ...` of Klipper's log."""
-    found = list(_STATS.finditer(text))
-    if len(found) < 2:  # noqa: PLR2004
+    lines = list(_STATS.finditer(text))
+    if len(lines) < 2:  # noqa: PLR2004
         return None
     records = []
-    for match in found:
+    for match in lines:
         record: dict[str, Any] = {"time [s]": match[1]}
         section = ""
         for word in match[2].split():
@@ -242,7 +242,7 @@ def _klipper(path: Path, text: str) -> list[Sheet] | None:
         records.append(record)
     sheet = _records(path, records)
     sheet.units = {n: "degC" for n in sheet.columns if n.endswith(("_temp", "_target"))} | {"time [s]": "s"}
-    sheet.place = lambda row: f"{path}:{text.count(chr(10), 0, found[row].start()) + 1}"
+    sheet.place = lambda row: f"{path}:{text.count(chr(10), 0, lines[row].start()) + 1}"
     return [sheet]
 
 
@@ -307,14 +307,14 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
         return None
     if tags and identity.startswith("_"):
         ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
-    found = []
+    sheets = []
     for name in pc.unique(ids).to_pylist():
         if not name or name.startswith("$"):  # WinCC marks the start and the end of its run by $RT_OFF$
             continue
         rows = np.flatnonzero(pc.equal(ids, name).to_numpy(zero_copy_only=False))
         place = _places(sheet.place, rows)
         columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value]}.items()}
-        found.append(
+        sheets.append(
             Sheet(
                 columns,
                 place,
@@ -323,7 +323,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
                 decimal=sheet.decimal,
             )
         )
-    return found or None
+    return sheets or None
 
 
 def _places(place: Callable[[int], str], rows: np.ndarray) -> Callable[[int], str]:

@@ -254,15 +254,15 @@ def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     for title, text in pages:
         try:
             here: list[str] = []
-            found = _text(path, text, how, here)
-            _table(path, found, how, list(here))
+            sheets_ = _text(path, text, how, here)
+            _table(path, sheets_, how, list(here))
         except InputError as e:
             first = first or e
             continue
         if len(pages) > 1:
             notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
         notes += here
-        return found
+        return sheets_
     raise first or InputError(f"{path}: no rows; at least one sample was expected")
 
 
@@ -293,9 +293,9 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     sheet = _fast(path, text, dialect, how)
     if sheet is None:
         return closely()
-    found = _stated(sheet, dialect)
-    found[0].again = closely  # reading cell by cell gives an error with the line
-    return found
+    stated = _stated(sheet, dialect)
+    stated[0].again = closely  # reading cell by cell gives an error with the line
+    return stated
 
 
 def _described(dialect: Dialect) -> str:
@@ -375,19 +375,19 @@ def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
     again: list[int] = []
     notes: list[str] = []
     for line, content in lines(text.decode("utf-8")):
-        found = cells_of(content, dialect.separator) if line >= dialect.first else []
-        found = found[:-1] if len(found) == width + 1 and not found[-1] else found
-        if found and (found in headers or (again and again[-1] == line - 1 and not _any_value(found))):
+        cells = cells_of(content, dialect.separator) if line >= dialect.first else []
+        cells = cells[:-1] if len(cells) == width + 1 and not cells[-1] else cells
+        if cells and (cells in headers or (again and again[-1] == line - 1 and not _any_value(cells))):
             again.append(line)
-        elif any(found):
-            (rows if len(found) == width else odd).append((line, found))
+        elif any(cells):
+            (rows if len(cells) == width else odd).append((line, cells))
     while len(rows) > 1 and _is_footer(rows[-1][1], rows[0][1]):
         odd.append(rows.pop())
     if not rows:
         raise InputError(f"{path}: no rows; at least one sample was expected")
     if odd and min(odd)[0] < rows[-1][0]:
-        line, found = min(odd)
-        raise InputError(f"{path}:{line}: {len(found)} cells; {width} as in the header were expected")
+        line, cells = min(odd)
+        raise InputError(f"{path}:{line}: {len(cells)} cells; {width} as in the header were expected")
     if odd:
         notes.append(
             f"line{'s' if len(odd) > 1 else ''} {', '.join(str(n) for n, _ in odd[:3])} at the end left out: "
@@ -454,35 +454,35 @@ def _valued(path: Path, sheet: Sheet, how: How) -> Sheet:
     """Return a sheet whose columns are numbers, times, or texts that are neither. Raises CellError."""
     texts = {n: c for n, c in sheet.columns.items() if not isinstance(c, np.ndarray)}
     decimal = how.decimal or _decimal(texts.values(), sheet)
-    found = replace(sheet, columns={}, units=dict(sheet.units), notes=list(sheet.notes))
+    valued = replace(sheet, columns={}, units=dict(sheet.units), notes=list(sheet.notes))
     left = []
     for name, column in sheet.columns.items():
         if isinstance(column, np.ndarray):
-            found.columns[name] = _without(column, how.missing)
+            valued.columns[name] = _without(column, how.missing)
             continue
         try:
-            values = _of_texts(name.partition("\0")[0], column, decimal, how.missing, found.notes)
+            values = _of_texts(name.partition("\0")[0], column, decimal, how.missing, valued.notes)
         except CellError as e:
             raise CellError(e.row, f"column '{name.partition(chr(0))[0]}': {e.reason}") from None
         if isinstance(values, cells.Numbers):
-            found.columns[name] = _without(values.values, how.missing)
-            found.notes += values.notes
-            stated = found.units.get(name)
+            valued.columns[name] = _without(values.values, how.missing)
+            valued.notes += values.notes
+            stated = valued.units.get(name)
             if values.unit and stated and stated != values.unit:
                 raise CellError(
                     0,
                     f"column '{name}': its header says {stated}, its cells {values.unit}; one unit was expected",
                 )
             if values.unit:
-                found.units[name] = values.unit
+                valued.units[name] = values.unit
         elif values is not None:
-            found.columns[name] = values
+            valued.columns[name] = values
         else:
-            found.left[name] = next((w for w in column.to_pylist() if w and w.strip()), "")
+            valued.left[name] = next((w for w in column.to_pylist() if w and w.strip()), "")
             left.append(name.partition("\0")[0].strip() or f"column {list(sheet.columns).index(name) + 1}")
     if left:
-        found.notes.append(f"columns of text left out: {', '.join(left)}")
-    return found
+        valued.notes.append(f"columns of text left out: {', '.join(left)}")
+    return valued
 
 
 def _without(values: np.ndarray, missing: Sequence[str]) -> np.ndarray:
@@ -537,7 +537,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
     """Return the tables of a sheet: one for each of its clocks, with the columns that hold numbers."""
     if not any(len(c) for c in sheet.columns.values()):
         raise InputError(f"{path}: no rows; at least one sample was expected")
-    found: list[Table] = []
+    tables: list[Table] = []
     several = _clocks(path, sheet, how)
     for timer, names in several:
         _refuse_lost(sheet, timer)
@@ -568,11 +568,11 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         if timer.seconds.start and len(t) and t[0] != 0:
             start, t = _moved(timer.seconds.start, float(t[0])), t - t[0]
         meta = sheet.meta | ({"start": start} if start else {})
-        found.append(
+        tables.append(
             Table(path.stem, str(path), t, values, meta, units, tuple(filter(None, notes)), recorded=True)
         )
-        _trace(how, timer, found[-1])
-    return found
+        _trace(how, timer, tables[-1])
+    return tables
 
 
 def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
@@ -812,12 +812,12 @@ def joined(parts: Sequence[Table]) -> Table:
 
 def parsed_columns(text: str | None) -> dict[str, str]:
     """Return the option `--columns A=B,C=D` as a mapping. Raises InputError."""
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for part in next(csv.reader(io.StringIO(text or "")), []):
         wanted, sign, name = (x.strip() for x in part.partition("="))
         if not (wanted and sign and name):
             raise InputError(f"--columns {part}: NAME=COLUMN was expected, such as heat=P_heater")
-        if wanted in found:
+        if wanted in names:
             raise InputError(f"--columns: '{wanted}' stands twice; give it once")
-        found[wanted] = name
-    return found
+        names[wanted] = name
+    return names
