@@ -75,10 +75,10 @@ def _to_journal() -> bool:
 
 
 def _render(_: Any, __: str, fields: MutableMapping[str, Any]) -> str:
-    at, event = fields.pop("time"), fields.pop("event")
+    time_, event = fields.pop("time"), fields.pop("event")
     if _to_journal():
-        return json.dumps({"time": at, "event": event, **fields}, default=str)
-    return " ".join([f"{at} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in fields.items())])
+        return json.dumps({"time": time_, "event": event, **fields}, default=str)
+    return " ".join([f"{time_} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in fields.items())])
 
 
 def _text(value: Any) -> str:
@@ -96,8 +96,8 @@ class _Stderr:
         """Write one line."""
         head = "\n" if self.torn else ""
         if self.lost:
-            at = line.split(" ", 1)[0] + " " if not line.startswith("{") else ""
-            head += f"{at}thermoctl: the log could not be written, {self.lost} lines are lost\n"
+            stamp = line.split(" ", 1)[0] + " " if not line.startswith("{") else ""
+            head += f"{stamp}thermoctl: the log could not be written, {self.lost} lines are lost\n"
         data = f"{head}{line}\n".encode(errors="backslashreplace")
         try:
             if sys.stderr is sys.__stderr__:

@@ -76,16 +76,16 @@ def dimension(unit: str) -> Dimension:
     Raises ValueError."""
     if len(unit) > _MAX_LENGTH:
         raise ValueError(f"'{unit[:20]}...' is longer than {_MAX_LENGTH} letters")
-    tokens, at = [], 0
+    tokens, position = [], 0
     text = unit.strip()
-    while at < len(text):
-        match = _TOKEN.match(text, at)
+    while position < len(text):
+        match = _TOKEN.match(text, position)
         if not match:
             raise ValueError(
-                f"'{unit}' is not a unit: '{text[at]}' was not expected; one such as W/K or N*s/m was"
+                f"'{unit}' is not a unit: '{text[position]}' was not expected; one such as W/K or N*s/m was"
             )
         tokens.append((match.lastgroup or "", match[match.lastgroup or 0]))
-        at = match.end()
+        position = match.end()
     try:
         result, rest = _product(tokens, 0)
     except IndexError:
@@ -139,46 +139,46 @@ def _spelled(unit: str) -> str:
 Tokens = list[tuple[str, str]]
 
 
-def _product(tokens: Tokens, at: int) -> tuple[Dimension, int]:
-    total, at = _factor(tokens, at)
-    while at < len(tokens) and tokens[at][1] != ")":
-        sign = -1 if tokens[at][1] == "/" else 1
-        if tokens[at][0] == "op" and tokens[at][1] != "(":
-            at += 1
-        factor, at = _factor(tokens, at)
+def _product(tokens: Tokens, position: int) -> tuple[Dimension, int]:
+    total, position = _factor(tokens, position)
+    while position < len(tokens) and tokens[position][1] != ")":
+        sign = -1 if tokens[position][1] == "/" else 1
+        if tokens[position][0] == "op" and tokens[position][1] != "(":
+            position += 1
+        factor, position = _factor(tokens, position)
         total = times(total, factor, sign)
-    return total, at
+    return total, position
 
 
-def _factor(tokens: Tokens, at: int) -> tuple[Dimension, int]:
-    kind, text = tokens[at]
-    at += 1
+def _factor(tokens: Tokens, position: int) -> tuple[Dimension, int]:
+    kind, text = tokens[position]
+    position += 1
     if text == "(":
-        base, at = _product(tokens, at)
-        if tokens[at][1] != ")":
+        base, position = _product(tokens, position)
+        if tokens[position][1] != ")":
             raise ValueError("')' was expected")
-        at += 1
+        position += 1
     elif kind == "symbol":
         base = _symbol(text)
     elif kind == "number" and text[0] not in "+-":
         base = ()
     else:
         raise ValueError(f"'{text}' was not expected")
-    if at < len(tokens) and tokens[at][0] == "raised":
-        return raised(base, float(tokens[at][1].translate(_RAISED))), at + 1
-    if at < len(tokens) and tokens[at][0] == "power":
-        at += 1
-        closing = tokens[at][1] == "("
-        at += closing
-        if tokens[at][0] != "number":
-            raise ValueError(f"the exponent '{tokens[at][1]}' is not a number")
-        base = raised(base, float(tokens[at][1]))
-        at += 1
+    if position < len(tokens) and tokens[position][0] == "raised":
+        return raised(base, float(tokens[position][1].translate(_RAISED))), position + 1
+    if position < len(tokens) and tokens[position][0] == "power":
+        position += 1
+        closing = tokens[position][1] == "("
+        position += closing
+        if tokens[position][0] != "number":
+            raise ValueError(f"the exponent '{tokens[position][1]}' is not a number")
+        base = raised(base, float(tokens[position][1]))
+        position += 1
         if closing:
-            if tokens[at][1] != ")":
+            if tokens[position][1] != ")":
                 raise ValueError("')' was expected")
-            at += 1
-    return base, at
+            position += 1
+    return base, position
 
 
 @cache
@@ -188,16 +188,14 @@ def _symbol(symbol: str) -> Dimension:
         return tuple(sorted((base, Fraction(int(power or 1))) for base, power in pairs))
     lookup, undefined = _pint()
     try:
-        symbol_ = lookup(symbol.replace("°C", "degC").replace("°", "deg"))
+        powers = lookup(symbol.replace("°C", "degC").replace("°", "deg"))
     except undefined:
         raise ValueError(f"pint knows no unit '{symbol}'") from None
-    if not set(symbol_) <= set(_BASES):
+    if not set(powers) <= set(_BASES):
         raise ValueError(f"'{symbol}' is no unit of physics that a plant may use")
     return tuple(
         sorted(
-            (_BASES[key], Fraction(power).limit_denominator(10_000))
-            for key, power in symbol_.items()
-            if power
+            (_BASES[key], Fraction(power).limit_denominator(10_000)) for key, power in powers.items() if power
         )
     )
 

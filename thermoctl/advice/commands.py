@@ -108,7 +108,7 @@ def _parameters(planned: Planned) -> Table:
     heads = ["parameter", "value", "± standard error", "the recording gives it"]
     shown = Table(*heads, *(["better course: ±"] if planned.better else []), box=None, header_style="bold")
     for p in planned.parameters:
-        known = "yes" if p.identified else "no" + (f": tied to {p.tied}" if p.tied else "")
-        row = [p.name, f"{p.value:.4g} {p.unit or ''}", f"{p.sd:.2g}", known]
+        answer = "yes" if p.identified else "no" + (f": tied to {p.tied}" if p.tied else "")
+        row = [p.name, f"{p.value:.4g} {p.unit or ''}", f"{p.sd:.2g}", answer]
         shown.add_row(*row, *([f"{planned.better.sd[p.name]:.2g}"] if planned.better else []))
     return shown

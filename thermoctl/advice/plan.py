@@ -94,10 +94,10 @@ def plan(
     except SimulationError as e:
         raise InputError(f"{plant.file}: the experiment cannot be simulated: {e}") from None
     drives = [model.excitation(t) for t in made]
-    known = case(plant, made, effects, Budget(1))
-    null = fitted(known, known.plant, (), known.null)
+    planned_case = case(plant, made, effects, Budget(1))
+    null = fitted(planned_case, planned_case.plant, (), planned_case.null)
     rates = np.concatenate([rates_of(model, d) for d in drives])
-    seen = visible(known, null, as_refitted(known, null).average)
+    seen = visible(planned_case, null, as_refitted(planned_case, null).average)
     return Planned(
         plant_findings(model, drives),
         float(sum(t.t[-1] - t.t[0] for t in made)),
@@ -178,10 +178,10 @@ def parameters(model: Model, tables: Sequence[Table]) -> list[Parameter]:
     fitted_sizes = {}
     for k, (name, _) in enumerate(problem.unknowns[: problem.n_parameters]):
         p = model.plant.parameters[name]
-        known = bool(alone[k] ** 2 * UNIFORM < 1)
+        identified = bool(alone[k] ** 2 * UNIFORM < 1)
         other = problem.unknowns[int(np.argmax(correlation[k]))][0] if len(sd) > 1 else None
         size = float(sd[k] * problem.scales[name].slope(p.value))
-        fitted_sizes[name] = Parameter(name, p.value, p.unit, size, known, None if known else other)
+        fitted_sizes[name] = Parameter(name, p.value, p.unit, size, identified, None if identified else other)
     return list(fitted_sizes.values())
 
 

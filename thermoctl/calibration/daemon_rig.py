@@ -252,7 +252,7 @@ def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
     now, newest = seen[-1]
     if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
         return True
-    window = [t for at, t in seen if at >= now - REST_S]
+    window = [t for t_s, t in seen if t_s >= now - REST_S]
     return now - seen[0][0] >= REST_S and bool(
         np.nanmax(np.nanmax(window, axis=0) - np.nanmin(window, axis=0)) <= REST_K
     )

@@ -59,14 +59,14 @@ def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     low, high = within_limits(settings, schedules)
     coil_c = float(next(iter(rig.now()["temperatures_c"].values())) or math.nan)
     peaks = [forecast(settings, s, coil_c)[1] for s in schedules]
-    known = [t for t in peaks if t is not None and math.isfinite(t)]
-    if known and max(known) > p.coil_limit_c:
+    predicted = [t for t in peaks if t is not None and math.isfinite(t)]
+    if predicted and max(predicted) > p.coil_limit_c:
         raise InputError(
-            f"{settings.path}: the coil would reach {max(known):.1f} degC, above protection.coil_limit_c ({p.coil_limit_c:g})"
+            f"{settings.path}: the coil would reach {max(predicted):.1f} degC, above protection.coil_limit_c ({p.coil_limit_c:g})"
         )
     warm = (
-        f"at most {max(known):.1f} degC predicted"
-        if known
+        f"at most {max(predicted):.1f} degC predicted"
+        if predicted
         else "not predicted (no model, or no reading of the coil)"
     )
     print(f"rig '{settings.rig.name}' ({settings.path}), back end {settings.hal.backend}: {rig.where}")

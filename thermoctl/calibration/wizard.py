@@ -98,10 +98,10 @@ class Wizard:
         try:
             state = json.loads(self.state_path.read_text())
             self.done = {k: RESULTS[k](**v) for k, v in state["done"].items()}
-            self.at_s, known = state["at_s"], state["configuration"]
+            self.at_s, configuration = state["at_s"], state["configuration"]
         except (ValueError, KeyError, TypeError, AttributeError):
             raise InputError(f"{self.state_path}: not a calibration's state; give another --out") from None
-        if known != self.fingerprint:
+        if configuration != self.fingerprint:
             raise InputError(
                 f"{self.folder}: was started with another configuration or other experiments than {self.settings.path} has now; "
                 "put them back, or start again with --again"

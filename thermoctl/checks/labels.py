@@ -172,8 +172,8 @@ def _draws(plant: Plant) -> Iterator[dict[str, float]]:
         for p in plant.parameters.values():
             if p.range:
                 low, high = p.range
-                at = rng.uniform()
-                drawn[p.name] = low * (high / low) ** at if low > 0 else low + at * (high - low)
+                z = rng.uniform()
+                drawn[p.name] = low * (high / low) ** z if low > 0 else low + z * (high - low)
         yield drawn
 
 

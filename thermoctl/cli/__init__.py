@@ -98,16 +98,18 @@ def _parsed(top: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Name
     """Return the parsed arguments.
 
     Raises SystemExit(2) for a mistake, with the usage of the command in which it was made."""
-    at, rest = top, list(words)
-    while rest and (below := _below(at)) and not rest[0].startswith("-"):
+    command_parser, rest = top, list(words)
+    while rest and (below := _below(command_parser)) and not rest[0].startswith("-"):
         if rest[0] not in below:
             named = {below[name].prog: name for name in below}
-            if not _similar(rest[0], named) or at is top:
+            if not _similar(rest[0], named) or command_parser is top:
                 named |= {f"thermoctl {row.name}": row.name.split()[-1] for row in COMMANDS}
-            at.error(f"unknown command '{rest[0]}'{_similar(rest[0], named)}")
-        at = below[rest.pop(0)]
-    if not rest and (below := _below(at)):
-        at.error(f"a command was expected: {', '.join(below)} (see `{at.prog} --help`)")
+            command_parser.error(f"unknown command '{rest[0]}'{_similar(rest[0], named)}")
+        command_parser = below[rest.pop(0)]
+    if not rest and (below := _below(command_parser)):
+        command_parser.error(
+            f"a command was expected: {', '.join(below)} (see `{command_parser.prog} --help`)"
+        )
     args, more = top.parse_known_args(words, argparse.Namespace(parser=top))
     if more:
         flags = {flag: flag for action in args.own._actions for flag in action.option_strings}

@@ -229,7 +229,7 @@ class _Supervision:
 
     def _end(self) -> None:
         """End all processes, the loop first; disable the amplifier where the loop did not end well."""
-        self.notify(f"STOPPING=1\nWATCHDOG_USEC={END_S * 1_000_000}")  # nothing feeds it from here on
+        self.notify(f"STOPPING=1\nWATCHDOG_USEC={END_S * 1_000_000}")  # the watchdog is not fed from here on
         ended_by_itself = not self.loop.alive
         self.loop.end(LOOP_STOP_S)
         if ended_by_itself or self.loop.process.exitcode != 0:

@@ -32,12 +32,12 @@ def find(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    known = {p.stem: p for folder in FOLDERS for p in shipped(folder).glob("*.yaml")}
-    if name not in known:
+    by_name = {p.stem: p for folder in FOLDERS for p in shipped(folder).glob("*.yaml")}
+    if name not in by_name:
         raise InputError(
-            f"{name}: no file, and no profile of the library{suggest(name, known)}: see `thermoctl devices list`"
+            f"{name}: no file, and no profile of the library{suggest(name, by_name)}: see `thermoctl devices list`"
         )
-    return known[name]
+    return by_name[name]
 
 
 def _rows() -> Iterator[tuple[str, str]]:

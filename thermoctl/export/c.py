@@ -73,7 +73,7 @@ def core(plant: Plant, e: Equations, numbers: Values, title: str = "") -> str:
 def time_jumps(e: Equations) -> str:
     """Return C of the jumps that are events in time: TIMED marks them, time_jump_ gives their arguments."""
     marked = [timed(e, z) for z, _ in e.jumps]
-    exprs = [z if at else num(0.0) for (z, _), at in zip(e.jumps, marked, strict=True)]
+    exprs = [z if is_marked else num(0.0) for (z, _), is_marked in zip(e.jumps, marked, strict=True)]
     return (
         f"{ints('TIMED', map(int, marked))}\nstatic double time_jump_(int i, double t, const double *p) {{\n"
         f"double out[NW + 1] = {{0}};\n{e.emit(exprs, 't p')}return out[i];\n}}\n"

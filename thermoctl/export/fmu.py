@@ -68,9 +68,11 @@ def _description(
         {i.unit for i in [*plant.readings(), *plant.parameters.values(), *plant.nodes.values()] if i.unit}
     )
     states = len(e.states)
-    at = 1 + len(plant.inputs) + len(e.parameters) + len(e.jumps) + len(first_outputs(plant)) + states
-    derivatives = range(at + states, at + 2 * states)
-    outputs = range(at + 2 * states, at + 2 * states + len(e.outputs))
+    first_state = (
+        1 + len(plant.inputs) + len(e.parameters) + len(e.jumps) + len(first_outputs(plant)) + states
+    )
+    derivatives = range(first_state + states, first_state + 2 * states)
+    outputs = range(first_state + 2 * states, first_state + 2 * states + len(e.outputs))
     sources = f'<SourceFiles><File name="{identifier}.c"/></SourceFiles>'
     exchange = f'  <ModelExchange modelIdentifier="{identifier}">{sources}</ModelExchange>\n'
     simulation = (
@@ -80,9 +82,9 @@ def _description(
     unknown = {
         "Outputs": outputs,
         "Derivatives": derivatives,
-        "InitialUnknowns": [*range(at, at + states), *derivatives, *outputs],
+        "InitialUnknowns": [*range(first_state, first_state + states), *derivatives, *outputs],
     }
-    reads = dict(zip((*derivatives, *outputs), _dependencies(plant, e, at), strict=True))
+    reads = dict(zip((*derivatives, *outputs), _dependencies(plant, e, first_state), strict=True))
     structure = "".join(
         f"    <{k}>\n"
         + "".join(

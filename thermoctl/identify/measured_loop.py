@@ -125,9 +125,9 @@ def measure(
 
     model, gains: the prediction whose weight the bands have; the loop ran with these gains."""
     t = rows[:, AT["t_s"]]
-    at = np.round((t - t[0]) / period_s).astype(int)
-    n = int(at[-1]) + 1
-    held = np.searchsorted(at, np.arange(n), side="right") - 1
+    ticks = np.round((t - t[0]) / period_s).astype(int)
+    n = int(ticks[-1]) + 1
+    held = np.searchsorted(ticks, np.arange(n), side="right") - 1
     r, y = (rows[held, AT[name]] for name in ("reference_um", "compensated_um"))
     w = 2 * np.pi * np.arange(1, n // 2) / (n * period_s)
     R, Y = np.fft.rfft(r - r[0])[1 : n // 2], np.fft.rfft(y - y.mean())[1 : n // 2]

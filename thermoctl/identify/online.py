@@ -117,5 +117,5 @@ class Tuner:
 
 def calibrated_gains(model: CompensatorModel) -> np.ndarray:
     """Return the static gains (points,) um/K of the calibration that a model came from, before any tuning."""
-    known = model.meta.get("calibrated_gains_um_k")
-    return np.array(known, dtype=float) if known is not None else (model.b1 + model.b2) / (1 - model.f1)
+    stored = model.meta.get("calibrated_gains_um_k")
+    return np.array(stored, dtype=float) if stored is not None else (model.b1 + model.b2) / (1 - model.f1)

@@ -112,11 +112,11 @@ def fit_response(
     Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept
     the drive before it. least_s: the dead time is at least this. present: gains whose FACTOR is the fastest
     loop that matters; None: any. Raises InputError when the recording does not determine the response."""
-    at = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
-    n = int(at[-1]) + 1
-    if len(at) < 20:
-        raise InputError(f"{len(at)} samples; at least 20 are needed to fit the position's response")
-    u = np.asarray(drive, float)[np.searchsorted(at, np.arange(n), side="right") - 1]
+    ticks = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
+    n = int(ticks[-1]) + 1
+    if len(ticks) < 20:
+        raise InputError(f"{len(ticks)} samples; at least 20 are needed to fit the position's response")
+    u = np.asarray(drive, float)[np.searchsorted(ticks, np.arange(n), side="right") - 1]
     u, y = u - u[0], np.asarray(y_um, float) - np.mean(y_um)
 
     def model(p: np.ndarray, gain: float = 1.0) -> SecondOrder:
@@ -127,7 +127,7 @@ def fit_response(
 
     def unit_response(p: np.ndarray) -> np.ndarray:
         """Return the positions (N,) at gain 1, um, about their mean."""
-        x = model(p).response(u, period_s)[at]
+        x = model(p).response(u, period_s)[ticks]
         return x - x.mean()
 
     def residual(p: np.ndarray) -> np.ndarray:

@@ -183,16 +183,16 @@ def parse(text: str | int | float) -> Expr:
     if len(text) > MAX_LENGTH:
         raise ExpressionError(f"an expression of {len(text)} characters; at most {MAX_LENGTH} are read")
     tokens: list[tuple[str, str]] = []
-    at = 0
+    position = 0
     text = text.rstrip()
-    while at < len(text):
-        match = _TOKEN.match(text, at)
+    while position < len(text):
+        match = _TOKEN.match(text, position)
         if not match:
             raise ExpressionError(
-                f"'{text[at : at + 12].strip()}' is not part of the language; allowed are {ALLOWED}"
+                f"'{text[position : position + 12].strip()}' is not part of the language; allowed are {ALLOWED}"
             )
         tokens.append((match.lastgroup or "", match.group(match.lastgroup or 0)))
-        at = match.end()
+        position = match.end()
     if len(tokens) > MAX_TOKENS:
         raise ExpressionError(f"an expression of {len(tokens)} words; at most {MAX_TOKENS} are read")
     if not tokens:

@@ -312,8 +312,8 @@ def _check_names(plant: Plant, items: Items) -> None:
     for p in _places(plant, items):
         for e in ex.walk(p.expression):
             if e.op == "name" and e.value not in p.names:
-                known = e.value in {*plant.inputs, *plant.parameters, *plant.nodes, "t"}
-                reason = "may not stand there" if known else "is not known" + suggest(e.value, p.names)
+                exists = e.value in {*plant.inputs, *plant.parameters, *plant.nodes, "t"}
+                reason = "may not stand there" if exists else "is not known" + suggest(e.value, p.names)
                 raise p.node.error(
                     f"{p.what}: '{e.value}' {reason}; allowed are {', '.join(sorted(p.names))}"[:600]
                 )

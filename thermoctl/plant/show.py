@@ -147,9 +147,9 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0, ti
     inch = figure.dpi
     sizes = np.array([_size(box, canvas, inch) for box in boxes]).reshape(-1, 2)
     x = _places(vertices, edges, sizes, widest)
-    for box, at in zip(boxes, x, strict=True):
-        box.set_position((at[0], at[1]))
-    taken = [np.array([at - q / 2, at + q / 2]) for at, q in zip(x, sizes, strict=True)]
+    for box, middle in zip(boxes, x, strict=True):
+        box.set_position((middle[0], middle[1]))
+    taken = [np.array([middle - q / 2, middle + q / 2]) for middle, q in zip(x, sizes, strict=True)]
     low = np.min([q[0] for q in taken], axis=0, initial=0.0) - MARGIN
     high = np.max([q[1] for q in taken], axis=0, initial=0.0) + MARGIN
     for a, b, kind, _ in edges:
@@ -266,31 +266,39 @@ def _label(
     inch: float,
 ) -> None:
     """Write the label of an edge where there is room for it; its place is appended to `taken`."""
-    at, way = (ends[0] + ends[1]) / 2, np.abs(ends[1] - ends[0])
+    middle, way = (ends[0] + ends[1]) / 2, np.abs(ends[1] - ends[0])
     words = textwrap.fill(label.replace("_", "_ "), 22, break_long_words=False).replace("_ ", "_")
     box = {"boxstyle": "square,pad=0.1", "fc": "#ffffff", "ec": "none"}
     text = axes.text(
-        at[0], at[1], words, fontsize=7.5, color="#7d8894", ha="center", va="center", zorder=2, bbox=box
+        middle[0],
+        middle[1],
+        words,
+        fontsize=7.5,
+        color="#7d8894",
+        ha="center",
+        va="center",
+        zorder=2,
+        bbox=box,
     )
     half = _size(text, canvas, inch) / 2
     bare = np.linalg.norm(way) * (1 - float(np.min(2 * half / np.maximum(way, 1e-9))))
-    if bare < BARE_IN or any((at + half > q[0]).all() and (at - half < q[1]).all() for q in taken):
+    if bare < BARE_IN or any((middle + half > q[0]).all() and (middle - half < q[1]).all() for q in taken):
         text.remove()
     else:
-        taken.append(np.array([at - half, at + half]))
+        taken.append(np.array([middle - half, middle + half]))
 
 
 def _legend(axes: Axes, low: np.ndarray, right: float, canvas: FigureCanvasAgg, inch: float) -> float:
     """Write the kinds of boxes below the drawing, in rows up to `right`; return their height in inches."""
-    at, row = float(low[0]), 0
+    left, row = float(low[0]), 0
     for edge, face, _, word in _STYLE.values():
         box = {"boxstyle": "round,pad=0.25", "fc": face, "ec": edge, "lw": 0.6}
         text = axes.text(0, 0, word, fontsize=8, color=edge, va="center", bbox=box)
         width = float(_size(text, canvas, inch)[0])
-        if at + width > right and at > low[0]:
-            at, row = float(low[0]), row + 1
-        text.set_position((at + 0.05, float(low[1]) - 0.2 - 0.26 * row))
-        at += width + 0.12
+        if left + width > right and left > low[0]:
+            left, row = float(low[0]), row + 1
+        text.set_position((left + 0.05, float(low[1]) - 0.2 - 0.26 * row))
+        left += width + 0.12
     return 0.4 + 0.26 * row
 
 

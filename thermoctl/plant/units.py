@@ -153,11 +153,11 @@ class _Check:
 
 
 def _alike(parts: Iterable[Dimension | None]) -> Dimension | None:
-    known = [p for p in parts if p is not None]
-    for other in known[1:]:
-        if other != known[0]:
-            raise ValueError(f"[{described(known[0])}] meets [{described(other)}]; they must be alike")
-    return known[0] if known else None
+    stated = [p for p in parts if p is not None]
+    for other in stated[1:]:
+        if other != stated[0]:
+            raise ValueError(f"[{described(stated[0])}] meets [{described(other)}]; they must be alike")
+    return stated[0] if stated else None
 
 
 def _power(e: Expr, a: list[Dimension | None]) -> Dimension | None:

@@ -190,8 +190,8 @@ def recorded_states(columns: Mapping[str, np.ndarray], meta: Mapping[str, str]) 
     if "points" not in meta:
         amplifier = slice(COIL - 4, COIL - 1)
         names = (*names[: amplifier.start], *names[amplifier.stop :], *names[amplifier])
-    words_ = np.column_stack([columns[n] for n in words("status", len(names), STATUS_PER_WORD)])
-    return dict(zip(names, _unpack(words_, len(names), STATUS_PER_WORD, 2).T, strict=True))
+    packed = np.column_stack([columns[n] for n in words("status", len(names), STATUS_PER_WORD)])
+    return dict(zip(names, _unpack(packed, len(names), STATUS_PER_WORD, 2).T, strict=True))
 
 
 @cache
@@ -218,8 +218,8 @@ def fault_words(rows: np.ndarray) -> np.ndarray:
 
 def units(names: Iterable[str]) -> dict[str, str]:
     """Return the units of those names that are signals of a rig, or end as a temperature's do."""
-    known = {s.name: s.unit for s in _EVERY_RIG}
-    by_name = {n: known.get(n, "degC" if n.endswith("_c") else "") for n in names}
+    fixed = {s.name: s.unit for s in _EVERY_RIG}
+    by_name = {n: fixed.get(n, "degC" if n.endswith("_c") else "") for n in names}
     return {n: unit for n, unit in by_name.items() if unit}
 
 

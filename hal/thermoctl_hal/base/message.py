@@ -40,10 +40,10 @@ def can_frame(message: Message, spec: Dbc, command: float, address: int) -> tupl
     """Return a message of the DBC file as (identifier, data). command: value of the signal."""
     if not isinstance(message, CanMessage):
         raise TypeError(f"{type(message).__name__} is no CAN message")
-    message_ = spec.database.get_message_by_name(message.name)
-    values = {s.name: 0.0 for s in message_.signals}
+    definition = spec.database.get_message_by_name(message.name)
+    values = {s.name: 0.0 for s in definition.signals}
     values |= {name: command if value is None else value for name, value in message.values.items()}
-    return spec.can_id(message.name, address), bytes(message_.encode(values, strict=False))
+    return spec.can_id(message.name, address), bytes(definition.encode(values, strict=False))
 
 
 def clipped(value: float, register: Register) -> float:

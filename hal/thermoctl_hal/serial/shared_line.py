@@ -82,11 +82,11 @@ _LOCK = threading.Lock()
 def join(path: str, line: LineSettings, user: Asked) -> SharedLine:
     """Return the shared line of this path, opened by its first user. Raises HardwareError."""
     with _LOCK:
-        line_ = _LINES.get(path)
-        if line_ is None or line_.broken:
-            line_ = _LINES[path] = SharedLine(path, line)
-        line_.users.append(user)
-        return line_
+        joined = _LINES.get(path)
+        if joined is None or joined.broken:
+            joined = _LINES[path] = SharedLine(path, line)
+        joined.users.append(user)
+        return joined
 
 
 def leave(line: SharedLine, user: Asked) -> None:

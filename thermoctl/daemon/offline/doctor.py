@@ -60,7 +60,7 @@ def check(settings: Settings) -> int:
 def _check(settings: Settings) -> int:
     law_parameters(settings)
     model = compensator(settings)
-    obstacles_: list[tuple[bool, str]] = []
+    reported: list[tuple[bool, str]] = []
     notes: list[str] = []
     with _drivers(settings):
         check_mode(settings)
@@ -71,12 +71,12 @@ def _check(settings: Settings) -> int:
                 *notes,
                 *filter(None, (origin(settings), unknown_group(settings))),
             ]
-        obstacles_ = list(obstacles(settings))
+        reported = list(obstacles(settings))
         warnings = power_warning(settings), priority_warning(settings), *device_warnings(settings)
-        obstacles_ += [(False, w) for w in warnings if w]
-    for in_the_way, line in obstacles_:
+        reported += [(False, w) for w in warnings if w]
+    for in_the_way, line in reported:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
-    bad = any(in_the_way for in_the_way, _ in obstacles_)
+    bad = any(in_the_way for in_the_way, _ in reported)
     verdict = "NOT READY, the rig could not be armed" if bad else "good"
     print(
         f"{settings.path}: {verdict}. back end {settings.hal.backend}, period {settings.loop.period_s * 1e3:g} ms, "
@@ -204,8 +204,8 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
 
 def _in_words(role: str, value: float) -> str:
     """Return what the amplifier's state means, '' for other channels."""
-    known = role == "amplifier_state" and value in range(len(AMPLIFIER_STATES))
-    return AMPLIFIER_STATES[int(value)] if known else ""
+    has_words = role == "amplifier_state" and value in range(len(AMPLIFIER_STATES))
+    return AMPLIFIER_STATES[int(value)] if has_words else ""
 
 
 @dataclass(frozen=True)

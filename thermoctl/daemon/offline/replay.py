@@ -113,9 +113,9 @@ def command(recording: str) -> int:
     )
     for name, (count, first, largest) in result.differences.items():
         row = rows[np.searchsorted(rows[:, AT["tick"]], first)]
-        at = datetime.fromtimestamp(row[AT["wall_s"]], UTC).isoformat(timespec="milliseconds")
+        wall_time = datetime.fromtimestamp(row[AT["wall_s"]], UTC).isoformat(timespec="milliseconds")
         print(
-            f"  {name}: differs in {count} ticks, first in tick {first} (t_s {row[AT['t_s']]:.3f}, {at}), by at most {largest:g}"
+            f"  {name}: differs in {count} ticks, first in tick {first} (t_s {row[AT['t_s']]:.3f}, {wall_time}), by at most {largest:g}"
         )
     if result.differences:
         return 1

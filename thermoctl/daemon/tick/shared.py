@@ -111,12 +111,12 @@ class Shared:
     def __init__(self, memory: mmap.mmap, path: Path, channels: Channels):
         self._memory, self._path = memory, path
         self.channels, self.row = channels, of_channels(channels)
-        at = 0
+        offset = 0
         self.areas: dict[str, np.ndarray] = {}
         for name, kind, shape in _areas(self.row):
-            array: np.ndarray = np.ndarray(shape, kind, memory, at)
+            array: np.ndarray = np.ndarray(shape, kind, memory, offset)
             self.areas[name] = array
-            at += array.nbytes
+            offset += array.nbytes
         a = self.areas
         self.ring = Ring(a["ring_head"], a["rows"])
         self.mailbox = Mailbox(a["mail_counters"], a["mail"])

@@ -272,12 +272,17 @@ class Watch:
         if newest is not None and newest.t_s <= t_s <= newest.t_s + AFTER_S:
             newest.faults = [*newest.faults, *(n for n in names if n not in newest.faults)]  # a consequence
             return
-        known = np.concatenate((*self._recent, rows))
-        known = known[(known[:, _T] >= t_s - BEFORE_S) & (known[:, _T] <= t_s + AFTER_S)]
+        captured = np.concatenate((*self._recent, rows))
+        captured = captured[(captured[:, _T] >= t_s - BEFORE_S) & (captured[:, _T] <= t_s + AFTER_S)]
         self._captured += 1
         self.captures.append(
             Capture(
-                self._captured, t_s, float(rows[k, _WALL]), names, known, bool(rows[-1, _T] > t_s + AFTER_S)
+                self._captured,
+                t_s,
+                float(rows[k, _WALL]),
+                names,
+                captured,
+                bool(rows[-1, _T] > t_s + AFTER_S),
             )
         )
 

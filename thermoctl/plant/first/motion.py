@@ -89,8 +89,8 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
 
 def _pace(t: np.ndarray, x: np.ndarray) -> float:
     """Return the size of the speed, from the places in a hundred parts of a recording."""
-    at = np.linspace(0, len(t) - 1, min(len(t), 100)).astype(int)
-    return max(float(np.std(np.diff(x[at]) / np.diff(t[at]))), 1e-12)
+    samples = np.linspace(0, len(t) - 1, min(len(t), 100)).astype(int)
+    return max(float(np.std(np.diff(x[samples]) / np.diff(t[samples]))), 1e-12)
 
 
 def _spread(values: np.ndarray) -> str:
@@ -122,8 +122,8 @@ def _sizes(
         float(np.sum((target - np.column_stack(c) @ f[0]) ** 2))
         for c, f in zip((plain, springy), fits, strict=True)
     ]
-    at = 2 if speed is not None else 3
-    spring = float(fits[1][0][at])
+    stiffness_column = 2 if speed is not None else 3
+    spring = float(fits[1][0][stiffness_column])
     with_spring = place is not None and spring > 0 and fits[1][0][0] > 0 and errors[1] < SPRING * errors[0]
     mass, damping = map(float, fits[with_spring][0][:2])
     travel = max(

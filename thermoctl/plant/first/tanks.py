@@ -20,10 +20,10 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     """Return the lines of a first plant file, from flows or a pump's command, and levels."""
     ids = identifiers([c.name for c in (*drives, *sensors)])
     levels = [c.values(table) for c in sensors]
-    known = all(d.kind == "flow" and d.unit for d in drives)
+    has_flow = all(d.kind == "flow" and d.unit for d in drives)
     inflow = np.sum([d.values(table) for d in drives], axis=0)
     area, outlet = _sizes(table.t, inflow, levels)
-    margin = MARGIN * (1.0 if known else UNKNOWN_SCALE)
+    margin = MARGIN * (1.0 if has_flow else UNKNOWN_SCALE)
     lines = [
         "inputs:",
         *(f"  {ids[d.name]}: {{{d.keys(ids[d.name])}}}{confirm(d.doubt)}" for d in drives),

@@ -53,14 +53,14 @@ def each(f: Callable[[T], R], items: Sequence[T], numbers: int) -> list[R]:
 
 def batches(queue: list[T], wanted: Callable[[T], bool]) -> Iterator[tuple[list[T], int]]:
     """Yield the wanted items of a queue that may grow, ABREAST at a time, and the number left after them."""
-    at = 0
-    while at < len(queue):
+    position = 0
+    while position < len(queue):
         batch: list[T] = []
-        while at < len(queue) and len(batch) < ABREAST:
-            batch += [queue[at]] if wanted(queue[at]) else []
-            at += 1
+        while position < len(queue) and len(batch) < ABREAST:
+            batch += [queue[position]] if wanted(queue[position]) else []
+            position += 1
         if batch:
-            yield batch, len(queue) - at
+            yield batch, len(queue) - position
 
 
 def give_back() -> None:

@@ -287,9 +287,9 @@ class Problem:
         evaluation with derivatives overwrites them, unless `self.keep` is called."""
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         keeping = self.keeps and keep is not None
-        known = (jacobian, keeping, self.huber)
+        key = (jacobian, keeping, self.huber)
         residuals = []
-        for r, part in enumerate(self.each(Problem._part, self.unpack(z), lambda r: known, jacobian + 1)):
+        for r, part in enumerate(self.each(Problem._part, self.unpack(z), lambda r: key, jacobian + 1)):
             cost += part.cost
             residuals.append(part.residual)
             if keep is not None:
@@ -337,18 +337,18 @@ class Problem:
         cost, gradient, matrix = 0.0, np.zeros(n), np.zeros((n, n))
         for prior in self.priors:
             r = next(r for r, d in enumerate(self.excitations) if d.name == prior.recording)
-            known = dict(zip(self.model.parameters, map(float, values[r]), strict=True))
-            cost += float(ex.evaluate(prior.neg2_log, known))
+            by_name = dict(zip(self.model.parameters, map(float, values[r]), strict=True))
+            cost += float(ex.evaluate(prior.neg2_log, by_name))
             used = [
-                (q, self.columns[r, c], self.scales[q].slope(known[q]))
+                (q, self.columns[r, c], self.scales[q].slope(by_name[q]))
                 for c, q in enumerate(self.model.active)
                 if derivatives and self.columns[r, c] >= 0 and q in ex.names(prior.neg2_log)
             ]
             for q, k, slope in used:
                 first = ex.derivative(prior.neg2_log, q)
-                gradient[k] -= 0.5 * slope * float(ex.evaluate(first, known))
+                gradient[k] -= 0.5 * slope * float(ex.evaluate(first, by_name))
                 for q2, k2, slope2 in used:
-                    second = float(ex.evaluate(ex.derivative(first, q2), known))
+                    second = float(ex.evaluate(ex.derivative(first, q2), by_name))
                     matrix[k, k2] += 0.5 * slope * slope2 * second
         return cost, gradient, matrix
 

@@ -158,8 +158,8 @@ def _floats(texts: pa.Array, missing: pa.Array) -> np.ndarray:
 
 def _refuse(name: str, tidy: pa.Array, wrong: np.ndarray, count: int) -> None:
     """Raise CellError for words among numbers; return for a column of remarks."""
-    words_ = pc.unique(tidy.filter(pa.array(wrong))).to_pylist()
-    if count == 0 or (len(words_) > FEW_WORDS and count <= wrong.sum()):
+    remarks = pc.unique(tidy.filter(pa.array(wrong))).to_pylist()
+    if count == 0 or (len(remarks) > FEW_WORDS and count <= wrong.sum()):
         return
     row = int(wrong.argmax())
     text = tidy[row].as_py()[:40]

@@ -317,25 +317,25 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, s
     return _one_order(by_order, prefer)
 
 
-def _one_order(orders_: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
+def _one_order(possible: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
     """Return the order of day and month that runs forward, evenly; any if all give the same seconds."""
-    if len(orders_) > 1:
-        forward = {k: ns for k, ns in orders_.items() if (np.diff(ns) >= 0).all()}
-        orders_ = forward or orders_
-    if len({(ns - ns[0]).tobytes() for ns in orders_.values()}) == 1 < len(orders_):
-        order = next(o for o in prefer if o in orders_)
-        return orders_[order], order + " (or another order: the seconds are the same)"
-    if len(orders_) > 1:  # steps of a second in one order are months in the other
+    if len(possible) > 1:
+        forward = {k: ns for k, ns in possible.items() if (np.diff(ns) >= 0).all()}
+        possible = forward or possible
+    if len({(ns - ns[0]).tobytes() for ns in possible.values()}) == 1 < len(possible):
+        order = next(o for o in prefer if o in possible)
+        return possible[order], order + " (or another order: the seconds are the same)"
+    if len(possible) > 1:  # steps of a second in one order are months in the other
         even, uneven = {}, 0
-        for order, ns in orders_.items():
+        for order, ns in possible.items():
             steps = np.diff(ns)
             if len(steps) > 1 and steps.max() <= 3 * np.sort(steps)[(len(steps) - 1) // 2]:
                 even[order] = ns
             uneven += len(steps) > 1 and steps.max() > 20 * max(steps.min(), 1)
-        if len(even) != 1 or uneven != len(orders_) - 1:
+        if len(even) != 1 or uneven != len(possible) - 1:
             raise ClockError(0, "day and month cannot be told apart; write the dates as 2026-03-14")
-        orders_ = even
-    ((order, ns),) = orders_.items()
+        possible = even
+    ((order, ns),) = possible.items()
     return ns, order
 
 

@@ -302,7 +302,7 @@ def _header(
         _index(path, line, width, data, notes)
     split = [split_words(c) for c in cells]
     names = [n for n, _ in split]
-    # Two columns that differ by their units only keep them in their names.
+    # If the names of two columns differ only by their units, the units stay part of the names.
     names = [c if names.count(n) > 1 else n for c, n in zip(cells, names, strict=True)]
     names = _distinct(path, line, names, data)
     units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}

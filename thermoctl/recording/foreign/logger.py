@@ -254,15 +254,15 @@ def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     for title, text in pages:
         try:
             here: list[str] = []
-            sheets_ = _text(path, text, how, here)
-            _table(path, sheets_, how, list(here))
+            read_sheets = _text(path, text, how, here)
+            _table(path, read_sheets, how, list(here))
         except InputError as e:
             first = first or e
             continue
         if len(pages) > 1:
             notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
         notes += here
-        return sheets_
+        return read_sheets
     raise first or InputError(f"{path}: no rows; at least one sample was expected")
 
 
@@ -351,13 +351,13 @@ def _plain_column(column: pa.ChunkedArray) -> Cells:
 
 
 def _body(text: bytes, dialect: Dialect) -> bytes:
-    at = 0
+    position = 0
     for _ in range(dialect.first - 1):
-        at = text.find(b"\n", at) + 1
-        if at == 0:
+        position = text.find(b"\n", position) + 1
+        if position == 0:
             return b""
-    body = text[at:]
-    return body if at < len(text) else b""
+    body = text[position:]
+    return body if position < len(text) else b""
 
 
 def _line(text: bytes, dialect: Dialect, row: int) -> int:
@@ -629,9 +629,9 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         plain = split_unit(how.time)[0]
         chosen = next((n for n in (how.time, plain) if n in names), None)
         if chosen is None:
-            known = [n for n in names if n.strip() and "\0" not in n]
+            named = [n for n in names if n.strip() and "\0" not in n]
             raise InputError(
-                f"{path}: no column '{how.time}'{suggest(how.time, known)}; the columns are {', '.join(known)}"
+                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}"
             )
         try:
             seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen))
@@ -752,12 +752,12 @@ def _united(path: Path, parts: Sequence[Table]) -> Table:
     columns: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
     for part, t in zip(parts, times, strict=True):
-        at = np.searchsorted(grid, t - near)
+        rows = np.searchsorted(grid, t - near)
         for name, values in part.columns.items():
             if name in columns:
                 raise InputError(f"{path}: the column '{name}' stands twice; rename one")
             columns[name] = np.full(len(grid), np.nan)
-            columns[name][at] = values
+            columns[name][rows] = values
         units |= part.units
     meta = {"start": first} if first and all(starts) else {}
     return Table(path.stem, str(path), grid, columns, meta, units, recorded=True)
