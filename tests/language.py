@@ -39,6 +39,7 @@ INSTEAD = {  # word or phrase: the field's word
     r"comes? out as|holds? against|held against": "say it directly: is, compared with",
 }
 _WORDS = re.compile(r"\b(?:" + "|".join(f"({p})" for p in INSTEAD) + r")\b", re.IGNORECASE)
+_HEADLESS = re.compile(r"(?:of|between) ")  # the start of a comment that does not name its quantity
 _SUBJECT = re.compile(r"(?:^|[.:;,] +)(?:what|whatever|that which) (?!if\b)", re.IGNORECASE)
 _DIRECTIVE = re.compile(r"#\s*(?:noqa|type:|cython:|distutils:|pragma|ruff:|fmt:|!|-{3,})")
 _AFTER = (tokenize.NEWLINE, tokenize.COMMENT)  # what follows a string that is a statement by itself
@@ -89,6 +90,8 @@ class Text:
                 found.append(f"'{m[0]}': {list(INSTEAD.values())[(m.lastindex or 1) - 1]}")
             if _SUBJECT.search(s) and not s.endswith("?"):
                 found.append("'what ...' as a noun: name the thing")
+        if self.path.suffix == ".py" and _HEADLESS.match(self.text.strip()):
+            found.append("starts with 'of' or 'between': name the quantity first")
         if self.columns > MAX_COLUMNS:
             found.append(f"{self.columns} columns")
         return found

@@ -16,6 +16,7 @@ def test_no_package_has_faults():
         ("Return " + "one word " * 13 + ".", "27 words in one sentence"),
         ("Hold the gain. What the filter expects is in q.", "name the thing"),
         ("Two explanations fit.", "'explanations': hypothesis"),
+        ("of a recording, at most", "name the quantity first"),
         ("Return the gain, K.", None),
         ("What is the gain?", None),
         ("Return the gain.\n\n    " + "x = y + " * 30 + "z", None),  # an equation

@@ -53,7 +53,7 @@ def check(settings: Settings) -> int:
     Returns 1 where the rig could never be armed.
     """
     with _drivers(settings):
-        make_backends(settings)  # of a rig with axes, the back end of each axis
+        make_backends(settings)  # back ends of all axes
     return _each_axis(settings, _check) if settings.axes else _check(settings)
 
 

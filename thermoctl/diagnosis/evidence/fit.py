@@ -283,7 +283,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
         converged=top.converged,
         left=2 * top.left,
     )
-    # of hundreds of recordings, the Hessian with all initial states would fill the memory
+    # with hundreds of recordings, the Hessian with all initial states would fill the memory
     rough = dataclasses.replace(
         rough, hessian=kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
     )

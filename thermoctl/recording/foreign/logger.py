@@ -442,7 +442,7 @@ def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str])
         raise InputError(f"{path}: no column of numbers beside the time; columns of text: {text or 'none'}")
     if not len(table):
         raise InputError(f"{path}: no rows; at least one sample was expected")
-    earliest: dict[str, str] = {}  # of notes that differ only in a clock's start, the earliest
+    earliest: dict[str, str] = {}  # the earliest of notes that differ only in a clock's start
     for note in (n for p in parts for n in p.notes):
         earliest[_SINCE.sub("", note)] = min(note, earliest.get(_SINCE.sub("", note), note))
     every = tuple(dict.fromkeys([*notes, *later, *earliest.values()]))
