@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"prove: {e}", file=sys.stderr)
         return 2
     console.print(tables.table(content))
-    console.print(f"written: {Path(args.out) / 'proof.json'}, {Path(args.out) / 'proof.html'}")
+    console.print(f"written: {Path(args.out) / 'proof.json'}")
     goals = [*content["goals"].values(), *content["open_world"].get("goals", {}).values()]
     return int(any(g["reached"] is False for g in goals))
 

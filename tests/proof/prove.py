@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from tests.proof.cases import find_jobs, read_answers
-from tests.proof.page import page
 from tests.proof.score import Row, plain, score
 from tests.proof.summary import summary
 from thermoctl import __version__
@@ -39,7 +38,7 @@ def prove(
 ) -> dict[str, Any]:
     """Run and score a set of cases; return the content of OUT/proof.json.
 
-    OUT/summary.json is the same without the cases, to be kept with a commit; OUT/proof.html is for people."""
+    OUT/summary.json is the same without the cases, to be kept with a commit."""
     out = Path(out_dir)
     jobs = find_jobs(cases, number)
     run_all(jobs, out / "cases", scheduler, workers, partial(run_one, report=False), progress)
@@ -58,7 +57,6 @@ def prove(
     with whole_files(out) as part:
         write_text(part / "proof.json", json.dumps(content, indent=1) + "\n")
         write_text(part / "summary.json", json.dumps(figures, indent=1) + "\n")
-        write_text(part / "proof.html", page(content, rows))
     return content
 
 
