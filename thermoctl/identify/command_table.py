@@ -45,10 +45,6 @@ TABLE: Table = {
                 metavar="Q",
                 help="spectral density of each body's unknown heat, W^2 s (default 0.05)",
             ),
-            argument(
-                "--gains", metavar="FILE", help="also write the time-varying gain on the coil's innovation"
-            ),
-            argument("--samples", type=int, default=2000, metavar="N", help="rows of --gains (default 2000)"),
         ),
     )
 }

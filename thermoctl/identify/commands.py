@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-
-import numpy as np
 
 from thermoctl.identify import linearise as thermal_model
 from thermoctl.identify.modelfile import save_model
 from thermoctl.plant import load
-from thermoctl.recording.files import write_table
-from thermoctl.recording.table import Table
 from thermoctl.rig.channels import DEFAULT, points_of_file
 
 
@@ -27,17 +22,6 @@ def linearise(args: argparse.Namespace) -> int:
         f"{plant.title}: order {len(model.A_minus_I)}, time constants {poles[0]:.4g} to {poles[-1]:.4g} s, "
         f"coil gain {model.gain[0, 0]:.4g}"
     )
-    if args.gains:
-        sequence = thermal_model.gains(
-            thermal_model.thermal(plant, channels=channels),
-            args.sensor_period,
-            args.samples,
-            density=args.heat_density,
-        )[:, :, 0]
-        t = np.arange(args.samples) * args.sensor_period
-        columns = {n: sequence[:, i] for i, n in enumerate(plant.nodes)}
-        write_table(args.gains, Table(Path(args.gains).stem, args.gains, t, columns))
-        print(args.gains)
     if args.out:
         print(save_model(args.out, model, args.rig, [args.plant], replace=args.replace))
     return 0

@@ -13,7 +13,7 @@ and, for a square C, in the coordinates of the readings: alpha = C A_h C^-1, bet
 
 Process noise is white heat of density q (W^2 s) into every body; it represents the plant's errors.
 Measurement noise is the thermocouple's noise and its resolution. The steady Kalman gain solves the discrete
-Riccati equation at the sensor's period; `gains` returns the time-varying gain from an uncertain start.
+Riccati equation at the sensor's period.
 """
 
 from __future__ import annotations
@@ -135,28 +135,6 @@ def discrete(
     loan = expm(np.block([[-model.A, heat], [np.zeros((n, n)), model.A.T]]) * period_s)  # van Loan 1978
     covariance = loan[n:, n:].T @ loan[:n, n:]
     return model.A @ phi, phi @ np.column_stack([model.b, -np.ones(n)]), (covariance + covariance.T) / 2
-
-
-def gains(
-    model: Thermal,
-    sensor_period_s: float,
-    samples: int,
-    sensors: tuple[int, ...] = (0,),
-    start_sd_k: float = 0.5,
-    density: float = HEAT_DENSITY,
-) -> np.ndarray:
-    """Return the time-varying Kalman gain (29), (30).
-
-    (samples, n, s), from rises that are uncertain by `start_sd_k` at the start."""
-    step, _, noise = discrete(model, sensor_period_s, density)
-    A, C, R = np.eye(len(step)) + step, model.C[list(sensors)], np.diag(model.variance[list(sensors)])
-    P = np.eye(len(A)) * start_sd_k**2
-    out = np.empty((samples, len(A), len(sensors)))
-    for k in range(samples):
-        out[k] = np.linalg.solve(C @ P @ C.T + R, C @ P).T
-        P = P - out[k] @ C @ P
-        P = A @ ((P + P.T) / 2) @ A.T + noise
-    return out
 
 
 def linearise(
