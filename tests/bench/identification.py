@@ -253,6 +253,11 @@ def scale() -> None:
             print(f"    ctrlsys does not run at 18 M: {type(e).__name__}: {str(e)[:90]}")
 
 
+def fed(bank: expansion.Bank, rises: np.ndarray, y: np.ndarray) -> None:
+    for r, v in zip(rises, y, strict=True):
+        bank.update(r, v)
+
+
 def output_error() -> None:
     held = {k: [] for k in ("recursion (5)", "output error", "bank")}
     spent = {}
@@ -273,15 +278,15 @@ def output_error() -> None:
         sigma = np.sqrt(0.25**2 / 12 + 0.07**2)
         bank = expansion.Bank(12, 1.0)
         spent["recursion (5)"], m5 = cpu(partial(paper.recursion, rises_in, read_in, 1.0))
-        spent["output error"], mo = cpu(partial(expansion.output_error, rises_in, read_in, 1.0, sigma))
-        spent["bank"], _ = cpu(partial(bank.update, rises_in, read_in))
-        for name, m in (("recursion (5)", m5), ("output error", mo), ("bank", bank.model())):
+        spent["output error"], mo = cpu(partial(expansion.output_error, [rises_in], [read_in], 1.0, sigma))
+        spent["bank"], _ = cpu(partial(fed, bank, rises_in, read_in))
+        for name, m in (("recursion (5)", m5), ("output error", mo), ("bank", bank.bounded(-np.inf, np.inf))):
             e = (y - m.predict(measured))[7200:]
             held[name].append(float(np.sqrt(np.mean(e**2))))
         if seed == 0:
             print(
                 f"    time constant, truth 180 s: recursion (5) {time_constant_s(m5):.1f} s (bias of the equation error), "
-                f"output error {time_constant_s(mo):.0f} s, bank {time_constant_s(bank.model()):.0f} s"
+                f"output error {time_constant_s(mo):.0f} s, bank {time_constant_s(bank.bounded(-np.inf, np.inf)):.0f} s"
             )
     r = {k: np.median(v) for k, v in held.items()}
     goal(

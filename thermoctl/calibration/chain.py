@@ -21,6 +21,7 @@ from thermoctl.identify.statespace import StateSpace
 STEP_K, NOISE_K = 0.25, 0.06  # resolution and noise of a thermocouple's reading
 ROW_NOISE = 1e-16  # K^2: keeps the Riccati equation regular for a state without noise
 AIR_FILTER_S = 60.0
+SENSOR_S = 0.1  # time between two readings of a thermocouple
 # order of the model in the first rounds; the last round selects it by BIC if none is given
 FIRST_ORDER = 6
 # Drift that no input explains, (time constant, corner) in s: it decays over two hours; above 1/(2 pi 250 s)
@@ -150,27 +151,22 @@ def fit_expansion(k: filter.Kalman, tests: list[Recorded]) -> expansion.Expansio
         1.0,
         sigma,
         [smooth_air(t.air_c) for t in tests],
-        lags=1,
         output_step_um=0.005,
     )
 
 
 def compensator(
-    kalman: filter.Kalman,
-    um: expansion.Expansion,
-    period_s: float = 0.001,
-    sensor_s: float = 0.1,
-    points: tuple[str, ...] = (),
+    kalman: filter.Kalman, um: expansion.Expansion, period_s: float = 0.001, points: tuple[str, ...] = ()
 ) -> CompensatorModel:
     """Build the daemon's compensator model at its own period.
 
-    Sensor readings come every `sensor_s`. Process noise is per second, so it scales with the period. A
+    Sensor readings come every SENSOR_S. Process noise is per second, so it scales with the period. A
     quantised reading ten times a second brings no more information than one a second, so its variance grows
     in proportion.
     """
     model = kalman.model
-    scale = sensor_s / model.period_s
-    at_sensor = _at_period(model, sensor_s)
+    scale = SENSOR_S / model.period_s
+    at_sensor = _at_period(model, SENSOR_S)
     q = kalman.noise * scale
     cs = at_sensor.c[:1]
     r = np.array([[filter.sensor_variance(STEP_K, NOISE_K) / scale]])

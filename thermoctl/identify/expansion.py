@@ -11,7 +11,7 @@ least-squares solution for each.
 
 Ridge: the gains g multiply the noise of the thermometers. Its variance is quantisation step^2/12 plus the
 sensor's own, times (1 - f1)/(1 + f1) after the filter 1/(z - f1). Adding N sigma^2 g'g to the criterion
-minimises the expected squared error *with such inputs*. The 25 nearly collinear parameters need that. The
+minimises the expected squared error *with such inputs*. The nearly collinear gains need that. The
 time constant itself is not well determined, but the prediction is.
 
 The output moves with the bodies' absolute temperatures, but the model has rises above the air. T_abs = rise +
@@ -28,7 +28,8 @@ import numpy as np
 from scipy import linalg, optimize, signal
 
 from thermoctl.files.yamlfile import InputError
-from thermoctl.identify import kernels
+
+BLOCK = 64  # samples that are rotated into the bank's triangles at once
 
 
 @dataclass(frozen=True)
@@ -57,66 +58,53 @@ class Expansion:
 
 
 def output_error(
-    rises: np.ndarray | list[np.ndarray],
-    y: np.ndarray | list[np.ndarray],
+    rises: list[np.ndarray],
+    y: list[np.ndarray],
     period_s: float,
     input_sigma_k: float | np.ndarray = 0.0,
-    air: np.ndarray | list[np.ndarray] | None = None,
+    air: list[np.ndarray] | None = None,
     tau_range_s: tuple[float, float] | None = None,
-    lags: int = 2,
     output_step_um: float = 0.0,
 ) -> Expansion:
-    """Fit the expansion by output error: search over f1, ridge least squares for the gains.
+    """Fit the expansion by output error: search over f1, ridge least squares for the gains on T(n).
 
-    rises (N, M) K, y (N,) um (NaN: not measured), or lists of recordings, each with an offset and a start of
-    its own. `air` (N,) degC ties b_air to the sum of the gains. `lags` 1 uses T(n) alone.
-    `input_sigma_k`: error of the inputs that the model will be driven by (quantisation included), one for all
-    or one each. `output_step_um`: the encoder's step; its variance is the least that a fit may leave.
+    rises (N, M) K and y (N,) um (NaN: not measured) of each recording, which has an offset and a start of its
+    own. `air` (N,) degC ties b_air to the sum of the gains. `input_sigma_k`: error of the inputs that the
+    model will be driven by (quantisation included), one for all or one each. `output_step_um`: the encoder's
+    step; its variance is the least that a fit may leave.
     The returned offset and start are those of the last recording."""
-    many = [rises] if isinstance(rises, np.ndarray) else rises
-    ys = [y] if isinstance(y, np.ndarray) else y
-    airs = [None] * len(many) if air is None else [air] if isinstance(air, np.ndarray) else air
-    for r, v in zip(many, ys, strict=True):
+    for r, v in zip(rises, y, strict=True):
         _check(r, v)
-    m = many[0].shape[1]
-    measured = np.concatenate(ys)
+    m, own = rises[0].shape[1], 2 * len(rises)
+    measured = np.concatenate(y)
     here = np.isfinite(measured)
-    if here.sum() < 4 * m:
-        raise InputError(f"{int(here.sum())} measured positions for {m} temperatures; at least {4 * m}")
-    drives = [r if a is None else r + (a - a[0])[:, None] for r, a in zip(many, airs, strict=True)]
-    lo, hi = tau_range_s or (2 * period_s, max(len(r) for r in many) * period_s / 4)
+    count = int(here.sum())
+    if count < 4 * m:
+        raise InputError(f"{count} measured positions for {m} temperatures; at least {4 * m}")
+    drives = [r + (a - a[0])[:, None] for r, a in zip(rises, air, strict=True)] if air else rises
+    lo, hi = tau_range_s or (2 * period_s, max(len(r) for r in rises) * period_s / 4)
     sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float) ** 2, (m,))
-    own = 2 * len(many)
 
     def solve(log_tau: float) -> tuple[float, np.ndarray, float]:
         """Return the cost, um^2, the coefficients and f1 at a time constant, given as ln(tau/s)."""
         f = float(np.exp(-period_s / np.exp(log_tau)))
         blocks = []
         for k, drive in enumerate(drives):
-            z = np.zeros((len(drive), m * lags + own))
-            now = signal.lfilter([0, 1 - f], [1, -f], drive, axis=0)
-            z[:, m * (lags - 1) : m * lags] = now
-            if lags == 2:
-                z[1:, :m] = now[:-1]
-            z[:, m * lags + 2 * k] = 1
-            z[:, m * lags + 2 * k + 1] = f ** np.arange(len(drive))
+            z = np.zeros((len(drive), m + own))
+            z[:, :m] = signal.lfilter([0, 1 - f], [1, -f], drive, axis=0)
+            z[:, m + 2 * k] = 1
+            z[:, m + 2 * k + 1] = f ** np.arange(len(drive))
             blocks.append(z)
         z = np.vstack(blocks)[here]
         g, right = z.T @ z, z.T @ measured[here]
-        noise = np.concatenate(
-            [np.tile(sigma2, lags) * (1 - f) / (1 + f) * here.sum(), np.full(own, 1e-9 * here.sum())]
-        )
-        noise[: m * lags] += 1e-6 * np.trace(g[: m * lags, : m * lags]) / (m * lags)
+        noise = np.concatenate([sigma2 * (1 - f) / (1 + f) * count, np.full(own, 1e-9 * count)])
+        noise[:m] += 1e-6 * np.trace(g[:m, :m]) / m
         theta = linalg.solve(g + np.diag(noise), right, assume_a="pos")
-        cost = (
-            float(((measured[here] - z @ theta) ** 2).sum() + theta @ (noise * theta))
-            + here.sum() * output_step_um**2 / 12
-        )
-        return cost, theta, f
+        left = float(((measured[here] - z @ theta) ** 2).sum() + theta @ (noise * theta))
+        return left + count * output_step_um**2 / 12, theta, f
 
     grid = np.linspace(np.log(lo), np.log(hi), 13)
-    costs = [solve(v)[0] for v in grid]
-    k = int(np.argmin(costs))
+    k = int(np.argmin([solve(v)[0] for v in grid]))
     best = optimize.minimize_scalar(
         lambda v: solve(v)[0],
         bounds=(grid[max(k - 1, 0)], grid[min(k + 1, 12)]),
@@ -124,26 +112,22 @@ def output_error(
         options={"xatol": 1e-3},
     )
     cost, theta, f = solve(best.x)
-    b2 = (1 - f) * theta[m * (lags - 1) : m * lags]
-    b1 = (1 - f) * theta[:m] if lags == 2 else np.zeros(m)
+    gains = (1 - f) * theta[:m]
     return Expansion(
         f,
-        b1,
-        b2,
+        np.zeros(m),
+        gains,
         period_s,
-        float((b1 + b2).sum()) if air is not None else 0.0,
+        float(gains.sum()) if air else 0.0,
         float(theta[-2]),
-        {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / here.sum()))},
+        {"method": "output error", "start_um": float(theta[-1]), "rms_um": float(np.sqrt(cost / count))},
     )
 
 
 class Bank:
-    """Online output error: fixed poles, each with a square-root RLS on inputs filtered by it.
+    """Online output error with one lag: for each of some fixed poles the triangle of its least squares.
 
-    The best pole is used.
-
-    Call `update(rises (K, M), y (K,))` with new samples in time order (NaN in y where the reference is
-    absent); `model()` gives the present Expansion. About 0.7 us a sample and pole for 12 temperatures."""
+    Call `update` with each new sample; `bounded` gives the Expansion of the best pole."""
 
     def __init__(
         self,
@@ -151,83 +135,54 @@ class Bank:
         period_s: float,
         poles: int = 16,
         tau_range_s: tuple[float, float] = (20.0, 2000.0),
-        weight: float = 1.0,
         prior_sigma: float = 30.0,
-        input_sigma_k: float | np.ndarray = 0.1,
+        input_sigma_k: float = 0.1,
     ):
-        p = 2 * inputs + 2
-        self.sigma2 = np.broadcast_to(np.asarray(input_sigma_k, float) ** 2, (inputs,))
-        self.period_s, self.weight, self.inputs = period_s, weight, inputs
+        self.period_s, self.inputs, self.sigma_k, self.samples = period_s, inputs, input_sigma_k, 0
         self.poles = np.exp(-period_s / np.geomspace(*tau_range_s, poles))
-        self.r = np.zeros((poles, p, p + 1))
-        self.r[:, np.arange(p), np.arange(p)] = 1 / prior_sigma
-        self.cost = np.zeros(poles)
-        self.state = np.zeros((poles, p - 1))
-        self.state[:, 2 * inputs] = 1.0
-        self.last = np.zeros((1, inputs))
-        self.samples = 0
+        # Unknowns: gains, initial output, offset. Each triangle has the measurement as its last column.
+        self.triangles = np.tile(np.eye(inputs + 2, inputs + 3) / prior_sigma, (poles, 1, 1))
+        # Inputs filtered by 1/(z - f1), and the decay of the initial output.
+        self.state = np.zeros((poles, inputs + 1))
+        self.state[:, -1] = 1.0
+        self.waiting: list[np.ndarray] = []  # rows (poles, inputs + 3) that are not yet in the triangles
 
-    def update(self, rises: np.ndarray, y: np.ndarray) -> None:
-        """Take rises (K, M) and measured positions (K,)."""
-        rises = np.ascontiguousarray(np.atleast_2d(rises), dtype=float)
-        if self.samples == 0 and len(rises):
-            self.last[0] = rises[0]
-        kernels.bank_run(
-            self.r,
-            self.cost,
-            self.state,
-            self.poles,
-            rises,
-            np.ascontiguousarray(y, dtype=float),
-            self.weight,
-            self.last,
-        )
-        self.samples += len(rises)
+    def update(self, rises: np.ndarray, y: float) -> None:
+        """Take temperature rises (M,) K and the measured position, um (NaN: none)."""
+        if np.isfinite(y):
+            self.waiting.append(np.column_stack([self.state, np.tile([1.0, y], (len(self.state), 1))]))
+            if len(self.waiting) == BLOCK:
+                self._fold()
+        f = self.poles[:, None]
+        self.state *= f
+        self.state[:, :-1] += (1 - f) * rises
+        self.samples += 1
 
-    def model(self) -> Expansion:
-        """Return the Expansion of the pole with the least criterion so far.
+    def _fold(self) -> None:
+        """Rotate the waiting rows into the triangles."""
+        if self.waiting:
+            rows = np.concatenate([self.triangles, np.stack(self.waiting, axis=1)], axis=1)
+            self.triangles = np.linalg.qr(rows, mode="r")
+            self.waiting = []
 
-        The criterion is the squared error plus, as in `output_error`, the ridge for the inputs' error.
-        """
-        m, p = self.inputs, self.r.shape[1]
-        best = (np.inf, 0, np.zeros(p))
-        for k in range(len(self.poles)):
-            rows = self._rows(k)
-            left = linalg.qr(rows, mode="r", check_finite=False)[0]
-            theta = linalg.solve_triangular(left[:p, :p], left[:p, p])
-            criterion = self.cost[k] + left[p, p] ** 2
-            if criterion < best[0]:
-                best = (criterion, k, theta)
-        _, k, theta = best
-        f = float(self.poles[k])
-        return Expansion(
-            f,
-            (1 - f) * theta[:m],
-            (1 - f) * theta[m : 2 * m],
-            self.period_s,
-            0.0,
-            float(theta[-1]),
-            {"method": "online bank", "start_um": float(theta[2 * m]), "samples": self.samples},
-        )
-
-    def bounded(self, low: np.ndarray, high: np.ndarray) -> Expansion:
-        """Return the best Expansion of one lag whose static gains (M,) um/K lie within low..high.
+    def bounded(self, low: np.ndarray | float, high: np.ndarray | float) -> Expansion:
+        """Return the best Expansion whose static gains (M,) um/K lie within low..high.
 
         Collinear gains that the data cannot separate are fitted within the bounds, not clipped afterwards.
+        The criterion has, as in `output_error`, the ridge for the inputs' error.
         """
+        self._fold()
         m = self.inputs
-        free = np.full(2, np.inf)
-        best = (np.inf, 0, np.zeros(m + 2))
-        for k in range(len(self.poles)):
-            rows = self._rows(k)
-            solution = optimize.lsq_linear(
-                rows[:, m:-1], rows[:, -1], (np.append(low, -free), np.append(high, free))
-            )
-            criterion = self.cost[k] + 2 * solution.cost
-            if criterion < best[0]:
-                best = (criterion, k, solution.x)
-        _, k, theta = best
-        f = float(self.poles[k])
+        bounds = np.full((2, m + 2), [[-np.inf], [np.inf]])
+        bounds[:, :m] = np.broadcast_to(low, m), np.broadcast_to(high, m)
+        best: tuple[float, float, np.ndarray] = (np.inf, 0.0, np.zeros(m + 2))
+        for f, rows in zip(self.poles, self.triangles, strict=True):
+            ridge = self.sigma_k * np.sqrt((1 - f) / (1 + f) * self.samples) * np.eye(m, m + 3)
+            both = np.vstack([rows, ridge])
+            found = optimize.lsq_linear(both[:, :-1], both[:, -1], bounds)
+            if found.cost < best[0]:
+                best = (found.cost, float(f), found.x)
+        _, f, theta = best
         return Expansion(
             f,
             np.zeros(m),
@@ -235,15 +190,8 @@ class Bank:
             self.period_s,
             0.0,
             float(theta[-1]),
-            {"method": "online bank, bounded", "start_um": float(theta[m]), "samples": self.samples},
+            {"method": "online bank", "start_um": float(theta[m]), "samples": self.samples},
         )
-
-    def _rows(self, k: int) -> np.ndarray:
-        """Return the triangle of pole k with the ridge for the inputs' error; right-hand side last."""
-        count = self.samples if self.weight == 1 else (1 - self.weight**self.samples) / (1 - self.weight)
-        f, p = self.poles[k], self.r.shape[1]
-        ridge = np.append(np.tile(self.sigma2, 2) * (1 - f) / (1 + f) * count, [0, 0])
-        return np.vstack([self.r[k], np.column_stack([np.diag(np.sqrt(ridge)), np.zeros(p)])])
 
 
 def _check(rises: np.ndarray, y: np.ndarray) -> None:

@@ -25,6 +25,9 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import kernels
 from thermoctl.identify.statespace import StateSpace, _c
 
+DECAY_S = 3600.0  # time constant of an outside heat
+SMOOTH = 30  # samples over which the filter's error is averaged
+
 
 def sensor_variance(step_k: float, noise_k: float) -> float:
     """R_v, K^2: quantisation step^2/12 and the sensor's own noise."""
@@ -69,15 +72,15 @@ class Kalman:
         return x @ self.model.c.T
 
 
-def disturbed(model: StateSpace, tau_s: float = 3600.0) -> StateSpace:
+def disturbed(model: StateSpace) -> StateSpace:
     """Return the model with one disturbance state: heat from outside into every body, the same K/s in each.
 
-    It decays with the time constant `tau_s`.
+    It decays with the time constant DECAY_S.
     """
     n, m = model.b.shape
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))
-    a[:n, :n], a[:n, n], a[n, n] = model.a, into, np.exp(-model.period_s / tau_s)
+    a[:n, :n], a[:n, n], a[n, n] = model.a, into, np.exp(-model.period_s / DECAY_S)
     return replace(
         model,
         a=a,
@@ -131,35 +134,26 @@ class Record:
     rises: np.ndarray
 
 
-def tune(
-    model: StateSpace,
-    records: list[Record],
-    r_v: float,
-    sensors: tuple[int, ...] = (0,),
-    smooth: int = 30,
-    weights: np.ndarray | None = None,
-) -> tuple[Kalman, np.ndarray]:
-    """Return the filter whose `sensors` estimate all points best over the calibration: (filter, variances).
+def tune(model: StateSpace, records: list[Record], r_v: float) -> tuple[Kalman, np.ndarray]:
+    """Return the filter that estimates all points best from the coil over the calibration, and its variances.
 
-    The error is averaged over `smooth` samples, so that the noise of the other thermometers has little
-    weight. `weights` (M,) are those of the points (default: equal). A weak prior on the logarithms keeps a
-    variance that the data do not determine."""
+    The error is averaged over SMOOTH samples, so that the noise of the other thermometers has little weight.
+    A weak prior on the logarithms keeps a variance that the data do not determine."""
     base = np.array([np.log(1e-2), np.log(1e-10), np.log(1e-6), np.log(1e-13)])
     used = 4 if not model.c[:, -1].any() else 3
-    w = np.ones(len(model.c)) if weights is None else weights / np.sqrt(np.mean(weights**2))
 
     def cost(x: np.ndarray) -> float:
         """Return the weighted mean square error, K^2, times the prior's factor; 1e9 without a steady filter.
 
         `x`: logarithms of the first variances; those it lacks keep their values in `base`."""
         try:
-            f = steady(model, np.exp(np.append(x, base[len(x) :])), r_v, sensors)
+            f = steady(model, np.exp(np.append(x, base[len(x) :])), r_v)
         except InputError:
             return 1e9
         total, count = 0.0, 0
         for rec in records:
-            e = (f.run(rec.power_w, rec.air_rate, rec.rises[:, list(sensors)]) - rec.rises) * w
-            e = np.nan_to_num(e[: len(e) // smooth * smooth]).reshape(-1, smooth, e.shape[1]).mean(1)
+            e = f.run(rec.power_w, rec.air_rate, rec.rises[:, 0]) - rec.rises
+            e = np.nan_to_num(e[: len(e) // SMOOTH * SMOOTH]).reshape(-1, SMOOTH, e.shape[1]).mean(1)
             total, count = total + float((e**2).sum()), count + e.size
         value = total / count
         return (value if np.isfinite(value) else 1e9) * (1 + 1e-4 * float(((x - base[: len(x)]) ** 2).sum()))
@@ -177,4 +171,4 @@ def tune(
         },
     )
     variances = np.exp(np.append(best.x, base[used:]))
-    return steady(model, variances, r_v, sensors), variances
+    return steady(model, variances, r_v), variances

@@ -142,7 +142,6 @@ def linearise(
     period_s: float = 0.001,
     sensor_period_s: float = 0.1,
     kind: str = "kalman",
-    sensors: tuple[int, ...] = (0,),
     density: float = HEAT_DENSITY,
     expansion_period_s: float = 1.0,
     channels: Channels = DEFAULT,
@@ -154,7 +153,7 @@ def linearise(
     model = thermal(plant, channels=channels)
     step, B, _ = discrete(model, period_s, density)
     slow, _, noise = discrete(model, sensor_period_s, density)
-    A, C1, R = np.eye(len(slow)) + slow, model.C[list(sensors)], np.diag(model.variance[list(sensors)])
+    A, C1, R = np.eye(len(slow)) + slow, model.C[:1], np.diag(model.variance[:1])
     try:
         P = solve_discrete_are(A.T, C1.T, noise, R)
     except (np.linalg.LinAlgError, ValueError) as e:
@@ -182,8 +181,7 @@ def linearise(
         np.zeros(len(C)),
         b2,
         expansion_period_s,
-        sensors,
-        model.air_um_k,
+        b_air=model.air_um_k,
         points=channels.point_names,
         meta={
             "made_from": "plant linearise",

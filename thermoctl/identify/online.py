@@ -60,7 +60,7 @@ class Tuner:
         self.recent.append((rises_k + air_k, error_um))
         if len(self.recent) > self.hold:
             old, error = self.recent.popleft()
-            self.bank.update(old[None], np.array([error]))
+            self.bank.update(old, error)
 
     @property
     def progress(self) -> float:
