@@ -82,7 +82,8 @@ def reduce(
     if isinstance(chunks, tuple):
         chunks = [chunks]
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # moments, sums and counts of the outputs
-    samples, left = 0, None
+    samples = 0
+    left: np.ndarray | None = None
     for cu, cy in chunks:
         cu, cy = np.atleast_2d(cu.T).T, np.atleast_2d(cy.T).T
         for k in range(0, len(cu), 100_000):  # small pieces: bounded memory whatever the caller's chunks are
