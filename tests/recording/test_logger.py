@@ -133,7 +133,7 @@ def test_every_guess_is_said_aloud(tmp_path):
 def test_our_own_files_go_the_old_way(tmp_path, monkeypatch):
     from thermoctl.recording.foreign import logger
 
-    monkeypatch.setattr(logger, "_sheets", lambda *_: 1 / 0)
+    monkeypatch.setattr(logger, "sheets_of", lambda *_: 1 / 0)
     assert len(read_recording(written(tmp_path, "# c\nt,x\n0,1\n1,\n"))) == 2
 
 

@@ -42,7 +42,7 @@ def tables_of(
 ) -> list[Table]:
     """Return one recording or several, in the plant's units; one with a gap in parts, with a warning.
 
-    `how`: see `logger.How`; of files only. Raises InputError."""
+    `how`: see `sheet.How`; of files only. Raises InputError."""
     items: Sequence[Any] = data if isinstance(data, list | tuple) else [data]
     read_tables = [_table(item, f"data_{k + 1}", time, columns, how) for k, item in enumerate(items)]
     return [part for table in read_tables for part in _parts(plant, table)] if plant else read_tables

@@ -1,4 +1,4 @@
-"""Rows as a file holds them, before their clock is known: a table, an Excel sheet, a group of channels."""
+"""Rows as a file holds them, before their clock is known; and a person's choices about their reading."""
 
 from __future__ import annotations
 
@@ -13,6 +13,30 @@ from thermoctl.recording.foreign.clock import Seconds
 
 Cells: TypeAlias = np.ndarray | pa.Array
 """A column: float64, datetime64 or timedelta64 values, or texts."""
+
+
+EQUAL_TIMES = ("spread", "mean", "first", "last")
+
+
+@dataclass(frozen=True)
+class How:
+    """Choices of a person about the reading of a file; the reader finds the others.
+
+    - `time`: column of times
+    - `sheet`: sheet of Excel, group of TDMS, variable of MATLAB
+    - `missing`: further words and numbers for "no value"
+    - `decimal`: the decimal sign
+    - `run`: the one to read of several in a file, from 1
+    - `equal_times`: see EQUAL_TIMES
+    - `trace`: receives how the file was read, for people"""
+
+    time: str | None = None
+    sheet: str | None = None
+    missing: tuple[str, ...] = ()
+    decimal: str | None = None
+    run: int | None = None
+    equal_times: str | None = None
+    trace: list[str] = field(default_factory=list, compare=False)
 
 
 @dataclass

@@ -1,0 +1,268 @@
+"""Open a file of any format as sheets of cells: its format by its first bytes, a text by its dialect."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from thermoctl.files.yamlfile import InputError
+from thermoctl.recording import files
+from thermoctl.recording.foreign import cells, clock, formats, layouts
+from thermoctl.recording.foreign.dialect import (
+    FACT,
+    Dialect,
+    cells_of,
+    decoded,
+    find_dialect,
+    is_comment,
+    lines,
+    stated_step,
+)
+from thermoctl.recording.foreign.sheet import Cells, How, Sheet
+from thermoctl.recording.foreign.timing import table_of
+from thermoctl.recording.foreign.units import split_words
+
+HEAD = 65536  # number of first bytes that show whether this program wrote the file
+MAGIC = (
+    (b"MDF     ", "mdf"),
+    (b"UnFinMF ", "mdf"),
+    (b"TDSm", "tdms"),
+    (b"PK\x03\x04", "excel"),
+    (b"PAR1", "parquet"),
+    (b"ARROW1", "arrow"),
+    (b"\x89HDF", "mat"),
+    (b"MATLAB ", "mat"),
+    (b"\xd0\xcf\x11\xe0", "xls"),
+    (b"\x1f\x8b", "gzip"),
+)
+_SUFFIXES = {
+    ".mf4": "mdf",
+    ".mdf": "mdf",
+    ".tdms": "tdms",
+    ".xlsx": "excel",
+    ".xlsm": "excel",
+    ".parquet": "parquet",
+}
+_SUFFIXES |= {".arrow": "arrow", ".arrows": "arrow", ".feather": "arrow", ".mat": "mat"}
+
+
+def kind_of(path: Path) -> str:
+    """Return the format by the first bytes, of an empty or damaged file by its suffix."""
+    with open(path, "rb") as f:
+        head = f.read(8)
+    suffix = path.suffix.lower()
+    if suffix in _SUFFIXES and (not head or suffix in (".arrow", ".arrows", ".feather")):
+        return _SUFFIXES[suffix]
+    found = next((kind for magic, kind in MAGIC if head.startswith(magic)), None)
+    return found or _SUFFIXES.get(suffix, "text")
+
+
+def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    """Read a file's sheets by its format."""
+    kind = kind_of(path)
+    how.trace.append(f"format: {kind}")
+    if kind in _READERS:
+        return [_of_names(s) for s in _READERS[kind](path, how, notes)]
+    if kind == "xls":
+        raise InputError(f"{path}: an Excel file of before 2007; save it as .xlsx or .csv")
+    if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
+        raise InputError(
+            f"{path}: {size} bytes; a text file of at most {files.MAX_CSV_BYTES} was expected (cut it in parts)"
+        )
+    data = path.read_bytes()
+    if kind == "gzip":
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError) as e:
+            raise InputError(f"{path}: not a whole gzip file: {e}") from None
+    text, said = decoded(path, data)
+    notes += said
+    return _text(path, text, how, notes)
+
+
+def _of_names(sheet: Sheet) -> Sheet:
+    """Return a sheet with the units that its columns' names state, such as 'P (mW)', as those of a text."""
+    split = {n: split_words(n) for n in sheet.columns}
+    plain = [name for name, _ in split.values()]
+    names = {
+        n: name if unit and n not in sheet.units and plain.count(name) == 1 else n
+        for n, (name, unit) in split.items()
+    }
+    units = sheet.units | {names[n]: unit for n, (_, unit) in split.items() if unit and names[n] != n}
+    return replace(sheet, columns={names[n]: c for n, c in sheet.columns.items()}, units=units)
+
+
+def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    table = files.read_table(path)
+    return [Sheet({"t": table.t, **table.columns}, lambda row: f"{path}: row {row + 1}", meta=table.meta)]
+
+
+def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    """Return the named sheet of an Excel file, else the first that holds a table."""
+    pages = formats.read_excel(path, how.sheet)
+    first: InputError | None = None
+    for title, text in pages:
+        try:
+            here: list[str] = []
+            read_sheets = _text(path, text, how, here)
+            table_of(path, read_sheets, how, list(here))
+        except InputError as e:
+            first = first or e
+            continue
+        if len(pages) > 1:
+            notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
+        notes += here
+        return read_sheets
+    raise first or InputError(f"{path}: no rows; at least one sample was expected")
+
+
+_READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
+    "mdf": lambda path, how, notes: formats.read_mdf(path, notes),
+    "tdms": lambda path, how, notes: formats.read_tdms(path, notes, how.sheet),
+    "mat": lambda path, how, notes: formats.read_mat(path, notes, how.sheet),
+    "parquet": lambda path, how, notes: [formats.read_arrow(path, pa.parquet.read_table(path))],
+    "arrow": _arrow,
+    "excel": _excel,
+}
+
+
+def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
+    """Read a text as sheets: a table of rows, or a layout of its own."""
+    if b"\0" in text:
+        raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
+    if (special := layouts.special(path, text)) is not None:
+        return [p for s in special for p in layouts.pivoted(s) or [s]]
+    dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
+    how.trace.append(f"read as: {_described(dialect)}")
+    notes += dialect.notes
+
+    def closely() -> list[Sheet]:
+        """Read the rows cell by cell."""
+        return _stated(_slow(path, text, dialect), dialect)
+
+    sheet = _fast(path, text, dialect, how)
+    if sheet is None:
+        return closely()
+    stated = _stated(sheet, dialect)
+    stated[0].again = closely  # reading cell by cell gives an error with the line
+    return stated
+
+
+def _described(dialect: Dialect) -> str:
+    shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(dialect.separator, f"'{dialect.separator}'")
+    return f"text, separator {shown}, data from line {dialect.first}"
+
+
+def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:
+    """Return a sheet with the units and the interval of its dialect; of a long table one a signal."""
+    sheet.units = dict(dialect.units)
+    sheet.columns = {n: c for n, c in sheet.columns.items() if not FACT.match(n)}
+    sheet.decimal = dialect.decimal or ("," if dialect.separator == ";" else None)
+    if (stated := stated_step(dialect.facts)) is not None:
+        sheet.step_s, sheet.offset_s = stated
+    return layouts.pivoted(sheet) or [sheet]
+
+
+def _fast(path: Path, text: bytes, dialect: Dialect, how: How) -> Sheet | None:
+    """Read by Arrow: plain numbers as floats, other columns as texts; None where that cannot be right."""
+    decimal = how.decimal or dialect.decimal
+    if decimal is None or dialect.separator in (" ", "  ") or "" in dialect.names:
+        return None
+    body = _body(text, dialect)
+    if b"\n#" in body or b"\n%" in body or body[:1] in b"#%":
+        body = b"\n".join(x for x in body.splitlines() if not is_comment(x.decode("utf-8")))
+    names = list(dialect.names)
+    try:
+        arrow = pa.csv.read_csv(
+            pa.BufferReader(body),
+            pa.csv.ReadOptions(column_names=names),
+            pa.csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
+            pa.csv.ConvertOptions(
+                column_types={n: pa.float64() if n in dialect.numeric else pa.string() for n in names},
+                null_values=["", "NaN", "nan", "NAN", "NA", "null"],
+                strings_can_be_null=False,
+                decimal_point=decimal,
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    if len(arrow) * len(names) > files.MAX_CELLS:
+        raise InputError(
+            f"{path}: {len(arrow)} rows; at most {files.MAX_CELLS} cells are read at once: cut it"
+        )
+    columns = {n: _plain_column(arrow[n]) for n in names}
+    return Sheet(columns, lambda row: f"{path}:{_line(text, dialect, row)}")
+
+
+def _plain_column(column: pa.ChunkedArray) -> Cells:
+    if pa.types.is_floating(column.type):
+        return files.to_numpy(column)
+    return column.combine_chunks()
+
+
+def _body(text: bytes, dialect: Dialect) -> bytes:
+    position = 0
+    for _ in range(dialect.first - 1):
+        position = text.find(b"\n", position) + 1
+        if position == 0:
+            return b""
+    body = text[position:]
+    return body if position < len(text) else b""
+
+
+def _line(text: bytes, dialect: Dialect, row: int) -> int:
+    """Return the line of data row `row`."""
+    numbers = (n for n, _ in lines(text.decode("utf-8")) if n >= dialect.first)
+    return next((n for i, n in enumerate(numbers) if i == row), dialect.first + row)
+
+
+def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
+    """Read row by row: repeated headers and a cut last line are left out with a note. Raises InputError."""
+    width = len(dialect.names)
+    headers = (list(dialect.header), [c for c in dialect.header if c])
+    rows: list[tuple[int, list[str]]] = []
+    odd: list[tuple[int, list[str]]] = []
+    again: list[int] = []
+    notes: list[str] = []
+    for line, content in lines(text.decode("utf-8")):
+        cells = cells_of(content, dialect.separator) if line >= dialect.first else []
+        cells = cells[:-1] if len(cells) == width + 1 and not cells[-1] else cells
+        if cells and (cells in headers or (again and again[-1] == line - 1 and not _any_value(cells))):
+            again.append(line)
+        elif any(cells):
+            (rows if len(cells) == width else odd).append((line, cells))
+    while len(rows) > 1 and _is_footer(rows[-1][1], rows[0][1]):
+        odd.append(rows.pop())
+    if not rows:
+        raise InputError(f"{path}: no rows; at least one sample was expected")
+    if odd and min(odd)[0] < rows[-1][0]:
+        line, cells = min(odd)
+        raise InputError(f"{path}:{line}: {len(cells)} cells; {width} as in the header were expected")
+    if odd:
+        notes.append(
+            f"line{'s' if len(odd) > 1 else ''} {', '.join(str(n) for n, _ in odd[:3])} at the end left out: "
+            f"{len(odd[0][1])} cells of {width}, or words only (was the file cut off?)"
+        )
+    if again:
+        notes.append(f"the header stands again in line {', '.join(map(str, again[:5]))}; left out")
+    numbers = [n for n, _ in rows]
+    columns = {n: pa.array([r[i] for _, r in rows], pa.string()) for i, n in enumerate(dialect.names)}
+    return Sheet(dict(columns), lambda row: f"{path}:{numbers[min(row, len(numbers) - 1)]}", notes=notes)
+
+
+def _is_footer(row: Sequence[str], first: Sequence[str]) -> bool:
+    """Return whether a row holds words only, or begins with one where the first row has a number or time."""
+    if _any_value(first) and not _any_value(row):
+        return any(not cells.is_missing(c) for c in row)
+    return _any_value(first[:1]) and not _any_value(row[:1]) and not cells.is_missing(row[0])
+
+
+def _any_value(row: Sequence[str]) -> bool:
+    """Return whether a cell is a number or a time."""
+    return any(cells.is_number(c) or clock.is_time(c) for c in row)
