@@ -38,7 +38,6 @@ from thermoctl.diagnosis.evidence.held_out import worth
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction, parameter_values
@@ -133,7 +132,7 @@ def bic(job: Job) -> dict[str, Any]:
     known, base = prepared(job)
     current = base
     for _ in range(MOST):
-        looked = screened(known, current, limits())
+        looked = screened(known, current)
         first: dict[tuple[str, str], Direction] = {}
         for d in sorted(looked.directions, key=lambda d: d.log_p):
             first.setdefault(d.candidate.key, sharpened(looked.metric, looked.rig, d))
@@ -156,7 +155,7 @@ def bic(job: Job) -> dict[str, Any]:
 def sindy(job: Job) -> dict[str, Any]:
     """Sparse regression of what the measured states' derivatives have beyond the plant's slopes."""
     known_case, base = prepared(job)
-    looked = screened(known_case, base, limits())
+    looked = screened(known_case, base)
     model, drives, rig, metric = base.fit.model, looked.metric.drives, looked.rig, looked.metric
     known: list[dict[str, np.ndarray]] = []  # per recording: the derivatives of the states that are measured
     at = []

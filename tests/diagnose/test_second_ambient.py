@@ -28,7 +28,7 @@ def test_its_refit_starts_where_it_gains_what_the_screening_promised(seed):
     table = compile_plant(truth).measure(table, seed=seed)
     known = case(loads(TWO_BLOCKS), [table], catalogue(), Budget(80))
     null = started(known, limits()).best
-    looked = screened(known, null.fitted, limits())
+    looked = screened(known, null.fitted)
     key = ("second_ambient", "one")
     promise, found = next(
         (p, d) for d, p in zip(looked.directions, looked.promises, strict=True) if d.candidate.key == key

@@ -53,7 +53,7 @@ def test_batches_take_what_is_wanted_from_a_queue_that_grows():
         taken.append((batch, left))
         if batch[0] == 1:
             queue.append(7)
-    assert taken == [([1, 3], 2), ([5, 7], 0)]
+    assert taken == [([1], 4), ([3, 5], 1), ([7], 0)]
 
 
 def test_items_that_are_split_again_are_taken_one_after_the_other(monkeypatch):

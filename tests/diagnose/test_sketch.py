@@ -13,6 +13,7 @@ from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.search import again
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import directions, groups_of, screen
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
@@ -55,9 +56,30 @@ def test_sketched_products_are_those_of_the_rows(chain):
 def test_what_a_sketch_keeps_holds_the_best_directions(chain, monkeypatch):
     metric, rig, found, _ = chain
     (every,) = screen([metric], rig, found)
-    monkeypatch.setattr(sys.modules[screen.__module__], "EXACT", 0)
+    monkeypatch.setattr(sys.modules[likeliest.__module__], "EXACT", 0)
     monkeypatch.setattr(sys.modules[likeliest.__module__], "KEPT", 300)
     (kept,) = screen([metric], rig, found, select=likeliest)
     assert len(kept) < 0.8 * len(every)
     assert [d.candidate.key for d in kept[:10]] == [d.candidate.key for d in every[:10]]
     assert [d.gain for d in kept[:10]] == pytest.approx([d.gain for d in every[:10]], rel=0.05)
+
+
+def test_what_a_later_screening_keeps_holds_the_best_directions(chain, monkeypatch):
+    """Also where only the residual has changed since: the rows of the first screening tell its gains."""
+    metric, rig, found, _ = chain
+    known = again.Known([run.y for run in metric.runs])
+    screen([metric], rig, found, norms=[], keep=known.add)
+    assert known.like(metric)
+    monkeypatch.setattr(again, "KEPT", 100)
+    monkeypatch.setattr(metric, "residual", metric.project(metric.residual[::-1].copy()))
+    (every,) = screen([metric], rig, found)
+    (kept,) = screen([metric], rig, found, select=known.likeliest)
+    assert len(kept) < 0.5 * len(every)
+    assert [d.candidate.key for d in kept[:10]] == [d.candidate.key for d in every[:10]]
+    assert [d.gain for d in kept[:10]] == pytest.approx([d.gain for d in every[:10]], rel=1e-3)
+
+
+def test_a_plant_that_moves_otherwise_is_screened_anew(chain):
+    metric, *_ = chain
+    assert not again.Known().like(metric)
+    assert not again.Known([1.3 * run.y for run in metric.runs]).like(metric)

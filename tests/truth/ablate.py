@@ -143,9 +143,9 @@ RULES: Mapping[str, Rule] = {
         {"search.beam.SURPLUS": float("inf")},
         searches=True,
     ),
-    "beaten": Rule(
-        "10 nats below a best that leaves only noise nothing is extended",
-        {"search.beam.BEATEN": float("inf")},
+    "near": Rule(
+        "4.6 nats below a best that leaves only noise nothing is refitted or extended",
+        {"search.beam.NEAR": float("inf")},
         searches=True,
     ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),

@@ -36,6 +36,7 @@ ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
 TOLD = 6  # largest number of outliers' times that a note lists for a column
+ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
 LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
 
 
@@ -187,7 +188,7 @@ def case(
     rtol = _rtol(drives, noise)
     for d in drives:
         d.rtol = rtol
-    null = fit(model, drives, noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
+    null = fit(model, drives, noise, fewer.z, iterations=40, tolerance=ROUGH, seconds=np.inf)
     as_stated = [
         d.y - model.run(d, values, np.zeros_like(dx0)).y
         for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)
@@ -243,7 +244,7 @@ def with_tables(case: Case, tables: Sequence[Table]) -> Case:
     Noise and accuracy are those of the case. Rows are not averaged again."""
     model = compile_plant(case.plant)
     drives = [dataclasses.replace(model.excitation(t), rtol=case.rtol) for t in tables]
-    null = fit(model, drives, case.noise, iterations=40, tolerance=1e-3, tries=2, seconds=np.inf)
+    null = fit(model, drives, case.noise, iterations=40, tolerance=ROUGH, seconds=np.inf)
     coordinates = Coordinates(drives)
     grids = _grids(coordinates, drives, null, Reduced(list(tables), case.block, 0, 0))
     return dataclasses.replace(

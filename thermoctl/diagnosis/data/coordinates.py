@@ -102,11 +102,28 @@ def quick(n: int) -> int:
 
 def transform(c: Channel, e: np.ndarray) -> np.ndarray:
     """Return the DCT rows (rows, ...) of a channel from its output's values (N, ...) at all samples."""
+    return dct(_blocks(c, e), axis=0, norm="ortho")[: c.rows]
+
+
+def transforms(channels: Sequence[Channel], e: np.ndarray) -> np.ndarray:
+    """Return the rows (rows, ...) of a recording's channels, in turn, from its values (N, outputs, ...).
+
+    Channels of the same samples are summed over their blocks at once: that is several times faster."""
+    first = channels[0]
+    if not all(c.block == first.block and np.array_equal(c.index, first.index) for c in channels):
+        return np.concatenate([transform(c, e[:, c.output]) for c in channels])
+    sums = _blocks(first, e)
+    return np.concatenate([dct(sums[:, c.output], axis=0, norm="ortho")[: c.rows] for c in channels])
+
+
+def _blocks(c: Channel, e: np.ndarray) -> np.ndarray:
+    """Return the sums over blocks of samples (blocks, ...), as large as white noise in one sample."""
     part = e if len(c.index) == len(e) else e[c.index]
-    if c.block > 1:
-        whole = len(part) // c.block * c.block
-        part = part[:whole].reshape(-1, c.block, *part.shape[1:]).sum(axis=1) / np.sqrt(c.block)
-    return dct(part, axis=0, norm="ortho")[: c.rows]
+    if c.block == 1:
+        return part
+    n = len(part) // c.block
+    each = part[: n * c.block].reshape(n, c.block, -1)
+    return np.matmul(np.full(c.block, c.block**-0.5), each).reshape(n, *part.shape[1:])
 
 
 class Coordinates:

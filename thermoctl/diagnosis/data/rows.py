@@ -63,12 +63,15 @@ GAP = 1.5  # a block that lasts so many times the usual duration lacks rows: it 
 
 @dataclass(frozen=True)
 class Reduced:
-    """Recordings with fewer rows. `block`: number of rows averaged to one; `before`, `after`: rows in all."""
+    """Recordings with fewer rows. `block`: number of rows averaged to one; `before`, `after`: rows in all.
+
+    `z`: unknowns of a rough refit, where one was needed."""
 
     tables: list[Table]
     block: int
     before: int
     after: int
+    z: np.ndarray | None = None
 
     def noise(self, plant: Plant, drives: Sequence[Excitation]) -> tuple[Noise, ...]:
         """Return the noise of each output in the averaged rows."""
@@ -125,9 +128,9 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     except SimulationError:
         return kept
     if block == 1:
-        return kept
+        return dataclasses.replace(kept, z=coarse_fit.z)
     out = [means(model, t, block, *start[:2]) for t, start in zip(tables, point, strict=True)]
-    return Reduced(out, block, before, sum(map(len, out)))
+    return Reduced(out, block, before, sum(map(len, out)), coarse_fit.z)
 
 
 def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float) -> int:

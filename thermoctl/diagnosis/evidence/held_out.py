@@ -20,6 +20,7 @@ from thermoctl.recording.table import Table
 ENOUGH = 3  # from this number of recordings on, the last one is set aside
 # Blocks of a recording; with too few recordings, every other block is fitted and the rest checked.
 BLOCKS = 16
+STEPS = 2  # largest number of steps from the refit of all blocks to that of half of them
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,13 @@ def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
         drives = [model.excitation(t) for t in train]
         try:
             refitted = refit.fit(
-                model, drives, case.noise, iterations=10, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
+                model,
+                drives,
+                case.noise,
+                iterations=STEPS,
+                tolerance=1e-3,
+                priors=f.fit.priors,
+                seconds=np.inf,
             )
             for r, t in enumerate(case.tables):
                 aside = model.excitation(_masked(t, measured, 1 - parity, False)).y

@@ -17,7 +17,7 @@ from thermoctl.plant.simulation.simulate import SimulationError
 TIMES = ("onset", "start", "end")  # shapes that are the time of a jump
 ONSETS = 24  # number of onset times in a screening's grid over the recordings
 FINER = 4  # each grid is finer than the one before by this factor
-GAIN = 2.0  # least decrease of the squared errors over the noise to move a time: one nat
+GAIN = 6.0  # least decrease of the squared errors over the noise to move a time: three nats
 
 
 def moved(case: Case, plant: Plant, effects: Sequence[Placed], fit: Fit) -> Plant | None:

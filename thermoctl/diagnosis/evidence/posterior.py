@@ -76,7 +76,8 @@ class Sums:
     """One recording's share of gradient and curvature of the log likelihood, by its unknowns (k,).
 
     - `gradient` (k,), `matrix` (k, k): J' E[1/V] R and J' E[1/V] J
-    - `by_band`: for each channel, J' R in each band (bands, k)"""
+    - `by_band`: for each channel, J' R in each band (bands, k); empty until `relief` asks for it, unless
+      slopes are not kept"""
 
     unknowns: np.ndarray
     gradient: np.ndarray
@@ -101,8 +102,11 @@ def _sums(
     slopes: Iterable[np.ndarray],
     rows: Sequence[np.ndarray],
     inverse: Sequence[np.ndarray],
+    bands: bool,
 ) -> Sums:
-    """Return a recording's sums from its channels' slopes, residuals' rows and weights of bands."""
+    """Return a recording's sums from its channels' slopes, residuals' rows and weights of bands.
+
+    `bands`: are sums by band needed, too?"""
     k = len(unknowns)
     gradient, matrix, by_band = np.zeros(k), np.zeros((k, k)), []
     for c, jac, row, weight in zip(channels, slopes, rows, inverse, strict=True):
@@ -110,8 +114,9 @@ def _sums(
         j = jac * w[:, None]
         gradient += j.T @ (w * row)
         matrix += j.T @ j
-        starts = np.cumsum(c.count) - c.count
-        by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))
+        if bands:
+            starts = np.cumsum(c.count) - c.count
+            by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))
     return Sums(unknowns, gradient, matrix, by_band)
 
 
@@ -130,7 +135,7 @@ def _simulated_sums(
     assert run.dy is not None
     dy = run.dy  # copied one channel at a time: a recording has megabytes
     slopes = (transform(c, dy[:, c.output, used]) * slope for c in channels)
-    return _sums(channels, unknowns, slopes, rows, inverse)
+    return _sums(channels, unknowns, slopes, rows, inverse, True)
 
 
 class Posterior:
@@ -208,11 +213,12 @@ class Posterior:
         return errors
 
     def sums(
-        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
+        self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray], bands: bool = False
     ) -> Sequence[Sums]:
         """Return each recording's share of gradient and curvature.
 
-        `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel."""
+        `rows`, `inverse`: the residuals' rows at z and the weights of their bands, by channel. `bands`: with
+        the sums by band."""
         data, begin = [], 0
         for channels in self.channels:
             end = begin + len(channels)
@@ -224,7 +230,8 @@ class Posterior:
         if self.kept is None or not np.array_equal(self.kept[0], z):
             self.errors_and_slopes(z)
         assert self.kept is not None
-        return [_sums(c, *slopes, *d) for c, slopes, d in zip(self.channels, self.kept[1], data, strict=True)]
+        parts = zip(self.channels, self.kept[1], data, strict=True)
+        return [_sums(c, *slopes, *d, bands) for c, slopes, d in parts]
 
     def slope(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray]
@@ -243,10 +250,10 @@ class Posterior:
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
         """Return the curvature that is lost because V is not known: the gradient's variance (Louis 1982)."""
         out = np.zeros((len(z), len(z)))
-        if self.newest is None or not np.array_equal(self.newest[0], z):
-            self.slope(z, rows, average.inverse)
-        assert self.newest is not None
-        by_band = [(s.unknowns, x) for s in self.newest[1] for x in s.by_band]
+        sums = self.newest[1] if self.newest is not None and np.array_equal(self.newest[0], z) else []
+        if not sums or not sums[0].by_band:
+            sums = self.sums(z, rows, average.inverse, True)
+        by_band = [(s.unknowns, x) for s in sums for x in s.by_band]
         powers = self.case.coordinates.powers(rows)
         for g, unsure in zip(self.case.grids, averaged(self.case.grids, powers, True).unsure, strict=True):
             pull = np.zeros((len(unsure), len(z)))

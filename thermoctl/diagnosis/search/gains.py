@@ -99,7 +99,7 @@ class Column:
 
 
 def _finite(v: np.ndarray) -> np.ndarray:
-    return np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0)
+    return v if np.isfinite(v @ v) else np.nan_to_num(v, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float]) -> dict[str, float]:

@@ -33,7 +33,6 @@ from thermoctl.plant.fitting.cores import ABREAST, LEAST, each
 
 EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
 CHUNK = 96
-EXACT = 4_000  # up to so many columns all are simulated
 
 
 Entry = tuple[Column, np.ndarray, float]  # a column, its rows after projection, its norm before
@@ -73,7 +72,12 @@ class Norms:
     left: float
 
 
+Keep = Callable[[Sequence[Column], np.ndarray], None]
 Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
+
+
+def ignored(columns: Sequence[Column], rows: np.ndarray) -> None:
+    """Keep no rows."""
 
 
 def screen(
@@ -83,21 +87,25 @@ def screen(
     edges: np.ndarray | None = None,
     select: Select = lambda metrics, trajectories, groups: groups,
     norms: list[Norms] | None = None,
+    keep: Keep = ignored,
 ) -> list[list[Direction]]:
     """Return every candidate's best direction, best first, in each of the metrics.
 
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
-    If there are more than EXACT columns, `select` chooses the groups that are simulated (sketch.py). If all
-    columns are simulated, their norms in the first metric are appended to `norms`."""
+    `select` chooses the groups that are simulated (sketch.py, again.py). If it chooses all, the norms of the
+    columns in the first metric are appended to `norms`. Then `keep` receives the columns and their rows."""
     first = metrics[0]
     trajectories = [Trajectory(first, rig, r) for r in range(len(first.drives))]
     groups = [g for c in placed for g in groups_of(c, first, edges)]
-    if sum(len(g.sizes) for g in groups) > EXACT:
-        groups, norms = select(metrics, trajectories, groups), None
+    every, groups = len(groups), select(metrics, trajectories, groups)
+    if len(groups) < every:
+        norms = None
     best: list[dict[int, Direction]] = [{} for _ in metrics]
     pending: dict[tuple[Any, ...], list[Entry]] = {}
     columns = (column for g in groups for column in g.columns())
     for part, plain in directions(first, trajectories, columns):
+        if norms is not None:
+            keep(part, plain)
         for metric, leaders in zip(metrics, best, strict=True):
             rows = plain * metric.weight[:, None]
             full = np.linalg.norm(rows, axis=0)

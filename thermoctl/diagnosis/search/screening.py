@@ -9,22 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
+from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transforms
 from thermoctl.diagnosis.data.grids import grid
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
-from thermoctl.diagnosis.evidence.levels import only_noise
+from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Absorbed, Metric, Pushed, without
-from thermoctl.diagnosis.search.screen import Norms, screen
+from thermoctl.diagnosis.search.screen import Keep, Norms, Select, ignored, screen
 from thermoctl.diagnosis.search.sketch import likeliest
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import Simulation
 
 ROWS = 6_000  # largest number of DCT rows, all outputs and recordings together
+LOUD = 2.0  # residual's rms over the noise, from which energy is the better guide
 FREE = 1e4  # standard deviation that stands for no prior
 PROMISED = 30  # number of directions whose gain in log likelihood is predicted
 ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
@@ -59,11 +60,7 @@ class Plain:
 
     def rows(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to the DCT rows of all its channels."""
-        return _rows(self.channels[r], e)
-
-
-def _rows(channels: Sequence[Channel], e: np.ndarray) -> np.ndarray:
-    return np.concatenate([transform(c, e[:, c.output]) for c in channels])
+        return transforms(self.channels[r], e)
 
 
 def _sensitive(
@@ -74,8 +71,8 @@ def _sensitive(
     run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
     assert run.dy is not None
     used, _, slope = problem.slopes(r, values)
-    rows = _rows(channels, run.dy[:, :, used]) * slope
-    return Simulation(run.t, run.x, run.y), _rows(channels, d.y - run.y), rows
+    rows = transforms(channels, run.dy[:, :, used]) * slope
+    return Simulation(run.t, run.x, run.y), transforms(channels, d.y - run.y), rows
 
 
 def _response(
@@ -89,12 +86,15 @@ def _response(
 ) -> np.ndarray:
     """Return the rows of a recording's responses (rows, count) to first-order changes."""
     d, point = problem.excitations[r], (values, dx0)
-    dy = np.zeros((*d.y.shape, count))
-    if pushed.forces:
-        dy = problem.model.respond(d, *point, pushed.forces, pushed.q, count, buffers=problem.buffers)
+    pushes, buffers = (pushed.forces, pushed.q, count), problem.buffers
+    dy = (
+        problem.model.respond(d, *point, *pushes, buffers=buffers)
+        if pushed.forces
+        else np.zeros((*d.y.shape, count))
+    )
     for (j, c), delta in pushed.read.items():
         dy[:, j, c] += delta
-    return _rows(channels, dy)
+    return transforms(channels, dy)
 
 
 class Rows(Metric):
@@ -218,7 +218,7 @@ class Screened:
 
     `energy`: the rows whitened by the sensors' noise alone; `by_energy`: all directions, sorted by their
     gain there. Where the plant has a large error, a first-order step predicts the log likelihood badly, and
-    this gain in energy is a better guide. Both are empty where the residual is only noise. `norms`: of all
+    this gain in energy is a better guide. Both are empty where the residual is not LOUD. `norms`: of all
     columns; empty where not all were simulated."""
 
     metric: Rows
@@ -230,14 +230,16 @@ class Screened:
     norms: list[Norms]
 
 
-def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
+def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened:
     """Screen the catalogue at the places of the original plant. Parts that an effect added are no places.
 
-    Where the residual is more than noise, screen a second time with the sensors' noise alone: by energy."""
+    Where the residual is far above the noise, screen a second time with that noise alone: by energy.
+    `known`: the first screening, which fills it; a later one may simulate few directions (again.py)."""
     refitted = as_refitted(case, fitted)
     plain = Plain(case, fitted, ROWS)
     metric = Rows(plain, refitted.average, True)
-    other = None if only_noise(case, refitted, limits) else Rows(plain, refitted.average, False)
+    loud = max(over_noise(case, refitted)) > LOUD
+    other = Rows(plain, refitted.average, False) if loud else None
     rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -249,7 +251,14 @@ def screened(case: Case, fitted: Fitted, limits: Thresholds) -> Screened:
     ]
     norms: list[Norms] = []
     metrics = [metric, other] if other else [metric]
-    best, *rest = screen(metrics, rig, placed, select=likeliest, norms=norms)
+    known = known or Known()
+    select: Select = likeliest
+    if known.count == 0:
+        known.outputs = [run.y for run in metric.runs]
+    elif other is None and known.like(metric):
+        select = known.likeliest
+    keep: Keep = ignored if known.count else known.add
+    best, *rest = screen(metrics, rig, placed, select=select, norms=norms, keep=keep)
     promised = [(d, metric.promise(d)) for d in foremost(best, ROOM * PLACES_EACH)[:PROMISED]]
     by_energy = rest[0] if rest else []
     if other:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.fit import Placed
+from thermoctl.diagnosis.evidence.fit import DECADES, Placed
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.places import PLACES
@@ -21,6 +21,11 @@ PAIR = 2
 EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 HALF = 2.0  # largest gain of a refit that is reckoned with, over its first-order promise
 ALIKE = 0.999  # limit of the cosine between two directions, so that their pair can be computed
+
+
+# The prior of a size takes log(SIZE root(promise)) off: its deviation over itself is 1 / root(2 promise).
+SIZE = float(2 * np.log(10.0) * DECADES / np.sqrt(np.pi))
+Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their predicted gain
 
 
 def relabels(c: Candidate) -> bool:
@@ -43,28 +48,42 @@ def _free_member(c: Candidate, side: str) -> bool:
     return any(n in parameters and parameters[n].range for n in ex.names(slope))
 
 
-def simpler(added: Sequence[Direction], looked: Screened) -> list[Direction]:
-    """Return the simpler entries at the places of `added`, to try instead of an insignificant effect."""
+def simpler(
+    added: Sequence[Direction],
+    gain: float,
+    looked: Screened,
+    where: Mapping[str, set[str]],
+    limits: Thresholds,
+) -> list[Extension]:
+    """Return the simpler entries at the places of `added`, to try instead of an insignificant effect.
 
-    def is_simpler(d: Direction, a: Direction) -> bool:
-        """Return whether d is the simpler effect at the place of a."""
-        new, old = d.candidate.effect, a.candidate.effect
-        fewer = len(new.parameters) < len(old.parameters)
-        return d.candidate.place.where == a.candidate.place.where and (fewer or new.name == old.contains)
+    The entry that an effect contains may gain as much as this one, others what they promise themselves."""
+    out = []
+    for d, promise in zip(looked.directions, looked.promises, strict=True):
+        here = [a.candidate.effect for a in added if a.candidate.place.where == d.candidate.place.where]
+        if d.gain > 0 and any(d.candidate.effect.name == a.contains for a in here):
+            out.append(((d,), gain))
+        elif d.gain > 0 and any(len(d.candidate.effect.parameters) < len(a.parameters) for a in here):
+            out.append(((d,), predicted(d, promise, where, limits)))
+    return out
 
-    return [d for d in looked.directions if d.gain > 0 and any(is_simpler(d, a) for a in added)]
+
+def predicted(d: Direction, promise: float, where: Mapping[str, set[str]], limits: Thresholds) -> float:
+    """Return the gain in score that a direction promises: its prior odds and that of its size are taken off.
+
+    A size that the data tell within a share of itself loses the logarithm of that share (fit.py)."""
+    size = 0.0 if d.candidate.effect.prior else np.log(SIZE * np.sqrt(max(promise, 1.0)))
+    return float(promise + odds((Placed(d.candidate, {}),), where, limits) - size)
 
 
-def shortlist(
-    looked: Screened, where: Mapping[str, set[str]], limits: Thresholds
-) -> list[tuple[tuple[Direction, ...], float]]:
+def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Thresholds) -> list[Extension]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
     First are those with the largest predicted gain, the best first. Then come those with the largest gain in
     energy, then pairs, both with an infinite gain. Each list has at most PLACES_EACH places of one effect."""
     worthwhile = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
-        gain = promise + odds((Placed(d.candidate, {}),), where, limits)
+        gain = predicted(d, promise, where, limits)
         if gain > 0 and d.gain > 0 and not relabels(d.candidate):
             worthwhile.append((d, gain))
     worthwhile.sort(key=lambda x: -x[1])

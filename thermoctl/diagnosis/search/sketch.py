@@ -30,6 +30,7 @@ from thermoctl.diagnosis.search.screen import Group
 from thermoctl.plant import expression as ex
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
+EXACT = 4_000  # up to so many columns all are simulated
 SKETCHES = 32  # number of sketches: a gain is known within 25 %
 KEPT = 1_500  # number of columns that are simulated, for each metric
 SAMPLES = 4_000  # largest number of samples of an adjoint run; forces are summed between samples
@@ -46,11 +47,14 @@ def likeliest(
     if code.input_delays or code.output_delays or code.fmus:
         return groups
     columns = [column for g in groups for column in g.columns()]
+    if len(columns) <= EXACT:
+        return groups
     edges = np.cumsum([len(g.sizes) for g in groups])[:-1]
     keep: set[int] = set()
     for product in products(metrics, trajectories, columns):
         parts = np.split(product, edges)
-        keep |= _best(groups, [_scored(list(g.columns()), x) for g, x in zip(groups, parts, strict=True)])
+        scored = [_scored(list(g.columns()), x) for g, x in zip(groups, parts, strict=True)]
+        keep |= foremost_groups(groups, scored, KEPT)
     return [groups[i] for i in sorted(keep)]
 
 
@@ -86,14 +90,14 @@ def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None
     return next((d for d in best.values() if d.gain > 0), None)
 
 
-def _best(groups: Sequence[Group], directions: Sequence[Direction | None]) -> set[int]:
-    """Return the positions of the best group of each of the best candidates, up to KEPT columns."""
+def foremost_groups(groups: Sequence[Group], directions: Sequence[Direction | None], most: int) -> set[int]:
+    """Return the positions of the best group of each of the best candidates, up to `most` columns."""
     best: dict[int, tuple[float, int]] = {}
     for i, (g, d) in enumerate(zip(groups, directions, strict=True)):
         if d is not None:
             best[id(g.candidate)] = min(best.get(id(g.candidate), (np.inf, i)), (d.log_p, i))
     order = [i for _, i in sorted(best.values())]
-    until = np.searchsorted(np.cumsum([len(groups[i].sizes) for i in order]), KEPT, side="right")
+    until = np.searchsorted(np.cumsum([len(groups[i].sizes) for i in order]), most, side="right")
     return set(order[:until])
 
 

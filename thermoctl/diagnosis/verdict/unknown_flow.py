@@ -36,6 +36,7 @@ from thermoctl.plant.simulation.simulate import SimulationError
 KNOTS, FEWEST, TOGETHER = 24, 6, 240
 # Iterations of flow and noise in turn, at most; they end where the evidence changes by fewer nats.
 ROUNDS, SETTLED = 4, 0.1
+FAR = 50.0  # nats below no flow, from which a share of the typical flow cannot win
 SHARES = 10.0 ** np.arange(-4.5, 0.6, 0.5)  # eta
 
 
@@ -127,13 +128,13 @@ def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> tuple[float, np
     """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method, and w.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
-    score, w = -np.inf, np.zeros(x.shape[1])
+    score, w = 0.0, np.zeros(x.shape[1])  # those of no flow
     for _ in range(ROUNDS):
         inside = x * weight[:, None]
         curvature = np.eye(x.shape[1]) + inside.T @ inside
         w = np.linalg.solve(curvature, inside.T @ (metric.residual * weight))
         likelihood, weight = metric.weighed(metric.residual - x @ w)
         before, score = score, likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
-        if abs(score - before) < SETTLED:
+        if abs(score - before) < SETTLED or score < -FAR:
             break
     return score, w

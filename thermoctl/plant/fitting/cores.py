@@ -52,15 +52,18 @@ def each(f: Callable[[T], R], items: Sequence[T], numbers: int) -> list[R]:
 
 
 def batches(queue: list[T], wanted: Callable[[T], bool]) -> Iterator[tuple[list[T], int]]:
-    """Yield the wanted items of a queue that may grow, ABREAST at a time, and the number left after them."""
-    position = 0
+    """Yield the wanted items of a queue that may grow, and the number left after them.
+
+    The first one is alone, as it may show that no other is wanted. ABREAST at a time follow."""
+    position, most = 0, 1
     while position < len(queue):
         batch: list[T] = []
-        while position < len(queue) and len(batch) < ABREAST:
+        while position < len(queue) and len(batch) < most:
             batch += [queue[position]] if wanted(queue[position]) else []
             position += 1
         if batch:
             yield batch, len(queue) - position
+            most = ABREAST
 
 
 def give_back() -> None:
