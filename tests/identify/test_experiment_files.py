@@ -83,7 +83,7 @@ def test_a_setpoint_among_inputs_is_a_schedule(folder):
         (("corners: [[0, 0], [10, 8], [300, 8], [310, 0], [600, 0]]", "corners: 5"), "two or more corners"),
         (("sample_s: 5", "sample_s: -5"), "a number from"),
         (("    title: Warm-up and cool-down\n", ""), "'title' is missing"),
-        (("    inputs:\n", "    inptus:\n"), "is not known"),
+        (("    inputs:\n", "    inptus:\n"), "unknown key"),
         (("      heat:", "      other: {corners: [[0, 0], [9, 1]]}\n      heat:"), "end at the same time"),
         (("/1", "/2"), "was expected"),
     ],

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from thermoctl.files import yamlfile
 from thermoctl.files.shipped import shipped
+from thermoctl.files.yamlfile import Section, load
 
 
 @dataclass(frozen=True)
@@ -26,14 +26,7 @@ class Thresholds:
 
 def limits() -> Thresholds:
     """Read the shipped numbers. Raises InputError where one is missing or not known."""
-    root = yamlfile.load(shipped("config") / "diagnosis.yaml")
-    names = {f.name for f in fields(Thresholds)}
-    for key, node in root.value.items():
-        if key not in names:
-            raise node.error(
-                f"unknown number '{key}'; known are {', '.join(sorted(names))}{yamlfile.suggest(key, names)}"
-            )
-    values = {key: node.plain()["value"] for key, node in root.value.items()}
-    for key in names - values.keys():
-        raise root.error(f"the number '{key}' is missing")
-    return Thresholds(**values)
+    top = Section(load(shipped("config") / "diagnosis.yaml"), "the numbers of a diagnosis")
+    sections = {f.name: top.section(f.name) for f in fields(Thresholds)}
+    top.end()
+    return Thresholds(**{name: s.get("value").value for name, s in sections.items()})

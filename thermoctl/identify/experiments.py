@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from thermoctl.control import arming, faults
-from thermoctl.files.yamlfile import InputError, Node, load, suggest
+from thermoctl.files.yamlfile import InputError, Node, Section, load
 from thermoctl.rig.signals import AT, fault_word
 
 FORMAT = "thermoctl-experiments/1"
@@ -387,18 +387,12 @@ def _stacked(rows: list[np.ndarray]) -> Iterator[np.ndarray]:
 
 
 def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = ()) -> dict[str, Node]:
-    allowed = needed | set(optional)
-    if not isinstance(node.value, dict):
-        raise node.error(f"{what}: a mapping with {', '.join(sorted(allowed))} was expected")
-    for key, value in node.value.items():
-        if key not in allowed:
-            raise value.error(
-                f"{what}: '{key}' is not known{suggest(key, allowed)}; {', '.join(sorted(allowed))} are"
-            )
+    s = Section(node, what)
+    s.asked.update(needed, optional)
+    s.end()
     for key in sorted(needed):
-        if key not in node.value:
-            raise node.error(f"{what}: '{key}' is missing")
-    return node.value
+        s.get(key)
+    return dict(node.value)
 
 
 def _number(node: Node, low: float, high: float) -> float:
