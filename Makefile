@@ -213,6 +213,11 @@ bench-laws: develop                # laws beside PySINDy, gplearn and a Gaussian
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python -m tests.bench.laws
 
+.PHONY: bench-published
+bench-published: develop           # systems of published papers: the diagnosis and the peers on the same readings, five seeds; run again to continue
+	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
+	$(BIN)/python -m tests.bench.published
+
 .PHONY: prove-laws
 prove-laws: develop                # concealed laws that the catalogue lacks: 102 cases and 40 without a law; half an hour and more; run again to continue
 	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws)

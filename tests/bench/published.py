@@ -11,9 +11,10 @@ paper       what the paper did, for those of Ebers, Steele, Kutz: low-pass filte
 
 The first three peers get the true place and the flow that our tracking smooths, the last two the true parameters, too.
 `right`: along the held-out run the rates dx/dt at all places that lack something are closer than EQUAL of the error
-of the refitted plant file. `rate`: that share, the worst place's. `coefficient`: largest relative error of the true
-form's coefficients, when the form is fitted to the rates found. `held out`: rms error of the forecast of the held-out run
-from its true start over that of the refitted plant file; `window` forecasts each of a chaotic system."""
+of the refitted plant file, and nothing is named that is not missing. `rate`: that share, the worst place's.
+`coefficient`: largest relative error of the true form's coefficients, when the form is fitted to the rates found.
+`held out`: rms error of the forecast of the held-out run from its true start over that of the refitted plant file;
+`window` forecasts each of a chaotic system."""
 
 from __future__ import annotations
 
@@ -76,7 +77,13 @@ def of_plant(plant: Plant, s: System, t: np.ndarray) -> Rates:
 
     def rates(q: Values) -> dict[str, np.ndarray]:
         known = inputs_by_name(plant, q)
-        own = {k: n for k, n in plant.nodes.items() if k not in known}
+        used = {
+            x
+            for f in plant.flows.values()
+            if {f.source, f.target} & s.missing.keys()
+            for x in ex.names(f.rate)
+        }
+        own = {k: n for k, n in plant.nodes.items() if k not in known and k in used}
         if own:
             others = {k: Input(k, None, k, True) for k, v in known.items() if np.ndim(v) == 1}
             flows = {k: f for k, f in plant.flows.items() if f.target in own or f.source in own}
@@ -336,6 +343,7 @@ def compared(s: System, seed: int) -> dict[str, dict[str, Any]]:
                 forecast = forecast_of_rates(rates, s)
             r["seconds"] = round(time.process_time() - started, 2)
             r |= judged(s, d, before, rates)
+            r["right"] = bool(r["right"] and {n.split(" at ")[0] for n in r.get("names", ())} <= s.names)
             r["held_out"] = min(forecast_error(s, d, forecast) / null, LOST)
         except Exception as e:  # a method that fails is a line of the table, too
             failed = {"rate": float("inf"), "right": False, "coefficient": float("inf"), "held_out": LOST}

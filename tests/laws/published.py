@@ -41,7 +41,8 @@ class Drawn:
 class System:
     """`rates`: dx/dt of each state from states and inputs. `missing`: by node the true law's rate dx/dt, a function
     of the signals and of its `coefficients`. `spoils`: sd of the noise by column and true states.
-    `published`: what the paper reports. `window`: seconds of a forecast (a chaotic system forgets its start).
+    `published`: what the paper reports. `names`: effects of the catalogue that are the law, or parts of it.
+    `window`: seconds of a forecast (a chaotic system forgets its start).
     `filtered`: the paper filters and differentiates the readings."""
 
     name: str
@@ -54,6 +55,7 @@ class System:
     noise: Callable[[dict[str, np.ndarray]], dict[str, float]]
     runs: Callable[[np.random.Generator], list[Run]]
     published: str
+    names: frozenset[str] = frozenset()
     window: float | None = None
     filtered: bool = False
 
@@ -382,6 +384,7 @@ SYSTEMS = (
         _flat(x_meas=0.1, v_meas=0.1),
         lambda rng: _cut(_times(50, 0.01), (0.1, 0.1), 0.6, _van_der_pol, _VDP),
         "sparse regression finds no term at this noise",
+        names=frozenset({"cubic_stiffness"}),
         filtered=True,
     ),
     System(
@@ -466,6 +469,7 @@ SYSTEMS = (
         _flat(lower=0.004),
         _pumped,
         "",
+        names=frozenset({"orifice_exponent"}),
     ),
     System(
         "friction",
@@ -478,5 +482,8 @@ SYSTEMS = (
         _flat(vel=0.01),
         _pushes,
         "force within 10 % (readings without noise)",
+        names=frozenset(
+            {"stribeck_friction", "coulomb_friction", "viscous_friction", "directional_friction"}
+        ),
     ),
 )

@@ -21,6 +21,7 @@ from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.propose import Proposal, propose_laws
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
 
@@ -44,7 +45,7 @@ def with_laws(
         if len(parent.fitted.hypothesis.effects) >= limits.effects:
             continue
         say("looking for a law")
-        laws = _laws(case, parent, s.best.score, limits, say)
+        laws = _laws(case, parent, s.tried[frozenset()], s.best.score, limits, say)
         s.keep(laws)
         if s.best in laws:
             grow(s)
@@ -53,12 +54,13 @@ def with_laws(
 
 
 def _laws(
-    case: Case, parent: Weighed, ahead: float, limits: Thresholds, say: Callable[[str], None]
+    case: Case, parent: Weighed, alone: Weighed, ahead: float, limits: Thresholds, say: Callable[[str], None]
 ) -> list[Weighed]:
-    """Return a hypothesis with the best law at each place.
+    """Return a hypothesis with the best law at each place, beside a parent and beside the plant alone.
 
-    Only laws that may come near the score `ahead` are refitted. Sums of terms are refitted only if a law with
-    one term reaches that score."""
+    Only laws that may come near the score `ahead` are refitted. Sums of terms follow if one term is ahead.
+    The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
+    them, too. There its promise is larger by what the effects gain."""
     try:
         proposals, _ = propose_laws(case, parent.fitted, limits.rare)
     except (SimulationError, np.linalg.LinAlgError):
@@ -71,17 +73,31 @@ def _laws(
         """Return minus the log prior odds of a law: for each term `missing` and `rare`, and its own cost."""
         return p.cost - term * len(p.terms)
 
-    refitted: list[tuple[Proposal, Weighed]] = []
-    for alone in (True, False):
-        some = [p for p in proposals if (len(p.terms) == 1) is alone]
-        tried = refits(case, parent.fitted, some, cost, ahead - BEATEN - parent.score, say)
-        refitted += [(p, Weighed(f, parent.log_odds - cost(p))) for p, f in tried]
-        if max((w.score for _, w in refitted), default=-np.inf) < ahead:
-            break
+    def refitted(base: Weighed, some: Sequence[Proposal]) -> list[tuple[Proposal, Weighed]]:
+        """Return the laws that were refitted beside a hypothesis."""
+        tried = refits(case, base.fitted, some, cost, ahead - BEATEN - base.score, say)
+        return [(p, Weighed(f, base.log_odds - cost(p))) for p, f in tried]
+
+    single = [p for p in proposals if len(p.terms) == 1]
+    beside = refitted(parent, single)
+    if max((w.score for _, w in beside), default=-np.inf) >= ahead:
+        beside += refitted(parent, [p for p in proposals if len(p.terms) > 1])
+    groups = [beside]
+    if parent is not alone:
+        more, plant = parent.score - alone.score, alone.fitted.plant
+        known = {*plant.nodes, *plant.inputs, *plant.parameters, "t"}
+        stands = [p for p in single if known >= {*p.place.nodes, *_names(p)}]
+        groups.append(refitted(alone, [replace(p, promise=p.promise + more) for p in stands]))
     return [
-        _best([x for x in refitted if x[0].place == place], limits)
-        for place in {p.place: 0 for p, _ in refitted}
+        _best([x for x in some if x[0].place == place], limits)
+        for some in groups
+        for place in {p.place: 0 for p, _ in some}
     ]
+
+
+def _names(p: Proposal) -> set[str]:
+    """Return the names that a law's signals read."""
+    return {n for t in p.terms for s in t.signals for n in ex.names(s.value)}
 
 
 def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
