@@ -141,7 +141,7 @@ static int sens_step(double t, double h, double ta, double dt, const double *u0,
 static const double RC_[POINTS + 1] = {0, 0.5, 0.5, 1, 0.75}, RB_[POINTS] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
 static const double RA_[POINTS] = {5.0 / 32, 7.0 / 32, 13.0 / 32, -1.0 / 32};
 static const double RE_[POINTS + 1] = {1.0 / 24, -0.125, -0.125, -0.125, 1.0 / 3};
-#define SHORT 0.2        /* of a step that the error allows: where explicit steps have to be shorter, ESDIRK takes the next ones */
+#define SHORT 0.5        /* of a step that the error allows: where explicit steps have to be shorter, those of ESDIRK cost less */
 #define STEEP 0.5        /* largest step times a bound of the eigenvalues; a state at rest passes any longer step, its slopes grow */
 #define LONGEST_WAIT 16  /* steps of ESDIRK before the next explicit try: 1, doubled with each failure */
 
