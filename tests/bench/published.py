@@ -344,7 +344,7 @@ def compared(s: System, seed: int) -> dict[str, dict[str, Any]]:
             r["seconds"] = round(time.process_time() - started, 2)
             r |= judged(s, d, before, rates)
             r["right"] = bool(r["right"] and {n.split(" at ")[0] for n in r.get("names", ())} <= s.names)
-            r["held_out"] = min(forecast_error(s, d, forecast) / null, LOST)
+            r["held_out"] = float(np.nan_to_num(min(forecast_error(s, d, forecast) / null, LOST), nan=LOST))
         except Exception as e:  # a method that fails is a line of the table, too
             failed = {"rate": float("inf"), "right": False, "coefficient": float("inf"), "held_out": LOST}
             r = {

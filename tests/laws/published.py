@@ -4,7 +4,8 @@
 plant language; the last recording is held out. Sources: Ebers, Steele, Kutz (2024), SIAM J. Appl. Dyn. Syst. 23:440
 and its code, noise of 0.1; Rackauckas et al. (2020), arXiv 2001.04385, settings of the documentation of SciML;
 Strouwen, Micluta-Campeanu (2026), arXiv 2604.01231; ModelingToolkitNeuralNets.jl, tutorial on friction; MATLAB's
-demonstration of IDNLGREY with two tanks; Wang (2026), arXiv 2606.23215, whose building is not published: ours is after it."""
+demonstration of IDNLGREY with two tanks, with holes and voltages of ours; Wang (2026), arXiv 2606.23215,
+whose building is not published: ours is after it."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ class Drawn:
 class System:
     """`rates`: dx/dt of each state from states and inputs. `missing`: by node the true law's rate dx/dt, a function
     of the signals and of its `coefficients`. `spoils`: sd of the noise by column and true states.
-    `published`: what the paper reports. `names`: effects of the catalogue that are the law, or parts of it.
+    `names`: effects of the catalogue that are the law, or parts of it.
     `window`: seconds of a forecast (a chaotic system forgets its start).
     `filtered`: the paper filters and differentiates the readings."""
 
@@ -54,7 +55,6 @@ class System:
     reads: dict[str, str]  # column: state
     noise: Callable[[dict[str, np.ndarray]], dict[str, float]]
     runs: Callable[[np.random.Generator], list[Run]]
-    published: str
     names: frozenset[str] = frozenset()
     window: float | None = None
     filtered: bool = False
@@ -383,7 +383,6 @@ SYSTEMS = (
         {"x_meas": "x", "v_meas": "v"},
         _flat(x_meas=0.1, v_meas=0.1),
         lambda rng: _cut(_times(50, 0.01), (0.1, 0.1), 0.6, _van_der_pol, _VDP),
-        "sparse regression finds no term at this noise",
         names=frozenset({"cubic_stiffness"}),
         filtered=True,
     ),
@@ -397,7 +396,6 @@ SYSTEMS = (
         {"x_meas": "x", "y_meas": "y", "z_meas": "z"},
         _flat(x_meas=0.1, y_meas=0.1, z_meas=0.1),
         lambda rng: _cut(_times(50, 0.01), (-8.0, 8.0, 27.0), 0.6, _lorenz, _XYZ),
-        "",
         window=1.0,
         filtered=True,
     ),
@@ -411,7 +409,6 @@ SYSTEMS = (
         {"T_in": "room"},
         _flat(T_in=0.05),
         _weeks,
-        "form always right, parameters 0.002 off (one global fit: 0.43)",
     ),
     System(
         "predator and prey, both terms missing",
@@ -426,7 +423,6 @@ SYSTEMS = (
         {"x": "rabbits", "y": "wolves"},
         lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
         lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
-        "both terms",
     ),
     System(
         "predator and prey, one term known",
@@ -438,7 +434,6 @@ SYSTEMS = (
         {"x": "rabbits", "y": "wolves"},
         lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
         lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
-        "",
     ),
     System(
         "bioreactor",
@@ -453,7 +448,6 @@ SYSTEMS = (
         {"Cs_meas": "Cs"},
         _flat(Cs_meas=0.1),
         _feeds,
-        "Monod's form after the third designed experiment",
     ),
     System(
         "two tanks",
@@ -468,7 +462,6 @@ SYSTEMS = (
         {"lower": "lower_level"},
         _flat(lower=0.004),
         _pumped,
-        "",
         names=frozenset({"orifice_exponent"}),
     ),
     System(
@@ -481,7 +474,6 @@ SYSTEMS = (
         {"vel": "v"},
         _flat(vel=0.01),
         _pushes,
-        "force within 10 % (readings without noise)",
         names=frozenset(
             {"stribeck_friction", "coulomb_friction", "viscous_friction", "directional_friction"}
         ),
