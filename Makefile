@@ -11,7 +11,7 @@ listed = $(BIN)/python -c "import tomllib; p = tomllib.load(open('pyproject.toml
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run help first-minute rig-hour test lint format install develop clean reproduce bench-identification test-identification prove calibrate-diagnosis
+.PHONY: run help first-minute rig-hour bench-law test lint format install develop clean reproduce bench-identification test-identification prove calibrate-diagnosis
 run: install                       # the closed loop on the simulated rig with a live view; Ctrl-C stops safely
 	$(BIN)/thermoctl demo --config config/simulated.yaml
 
@@ -25,6 +25,10 @@ first-minute: install              # errors with and without compensation at 20,
 rig-hour: install                  # an hour of rig time in the paper's trapezoids, compensation on and off, measured by the reference encoder
 	$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1
 	-$(BIN)/thermoctl run --config config/simulated.yaml --simulated-time --hours 1 --no-compensation
+
+bench-law: develop                 # cost of a call of the law, by compiler
+	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
+	$(BIN)/python tests/bench/law_call.py
 
 # Tests that only compute share two cores; then those that run in real time have both to themselves.
 COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs truth)
@@ -122,6 +126,10 @@ bench: develop                     # speed of plants beside scipy and CasADi
 bench-scale: develop               # cost of a diagnosis by rows; BEFORE=a checkout of an older version, beside it; minutes
 	$(BIN)/python -m tests.bench.scale rows $(if $(BEFORE),--before $(BEFORE))
 
+.PHONY: bench-parts
+bench-parts: develop               # where the time of a diagnosis goes, by family and stage; CASES= folders of cases; BEFORE= another checkout
+	$(BIN)/python -m tests.bench.parts $(if $(BEFORE),--before $(BEFORE)) $(CASES)
+
 .PHONY: bench-bodies bench-recordings
 bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
 	$(BIN)/python -m tests.bench.scale bodies
@@ -198,6 +206,10 @@ test-browser: develop docs         # the dashboard, the reports and the site in 
 .PHONY: pictures
 pictures: develop                  # test-browser, and its screenshots into docs/images
 	THERMOCTL_PICTURES=docs/images $(BIN)/python -m pytest -m slow tests/people/test_dashboard.py tests/people/test_pages.py tests/people/test_calibrate.py
+
+.PHONY: test-fleet
+test-fleet: develop                # many rigs' recordings, from a folder and an object store, also spread by Dask
+	$(BIN)/python -m pytest -m "slow or not slow" tests/fleet/test_fleet.py
 
 .PHONY: test-wizard
 test-wizard: develop               # thermoctl calibrate from doctor to proof, with shortened tests

@@ -25,6 +25,7 @@ COMMANDS = {  # every command that means a rig, as it would be typed without --c
     "service": ["install"],
     "dashboard": ["--commands"],
     "monitor": [],
+    "mqtt": ["--broker", "b"],
     "tune": [],
     "experiment": ["test_1"],
     "identify": ["a", "b", "c"],

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 RUN, LOOK, CALIBRATE = "run a rig", "look at a rig and its recordings", "calibrate a rig"
-MODEL, DIAGNOSE, HELP = "model", "diagnose", "help"
-PURPOSES = (RUN, LOOK, CALIBRATE, MODEL, DIAGNOSE, HELP)
+MODEL, DIAGNOSE, MANY_RIGS, HELP = "model", "diagnose", "many rigs", "help"
+PURPOSES = (RUN, LOOK, CALIBRATE, MODEL, DIAGNOSE, MANY_RIGS, HELP)
 """The purposes of commands, in the order of `thermoctl --help`."""
 
 

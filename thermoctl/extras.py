@@ -25,8 +25,9 @@ EXTRAS = {
         "nptdms": "npTDMS",
         "openpyxl": "openpyxl",
     },
+    "mqtt": {"paho": "paho-mqtt"},
     "fmu": {"fmpy": "FMPy"},
-    "fleet": {"dask": "dask", "distributed": "distributed"},
+    "fleet": {"dask": "dask", "distributed": "distributed", "fsspec": "fsspec"},
 }
 """The package to install by the name that is imported, for each extra of pyproject.toml."""
 

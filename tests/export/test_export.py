@@ -1,6 +1,7 @@
 """Exported plants give the outputs of our own simulation within 1e-6 of each output's range."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 import warnings
@@ -12,7 +13,9 @@ from tests.export.plants import FRICTION, plants, recording
 from thermoctl import cli
 from thermoctl.export.commands import write
 from thermoctl.files.yamlfile import InputError
+from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
+from thermoctl.plant.simulation.equations import Equations, argument
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 
@@ -167,6 +170,64 @@ def test_a_jump_of_time_is_an_event_of_the_fmu(tmp_path):
     fmu.freeInstance()
 
 
+def test_modelica_has_the_same_equations(case, tmp_path):
+    """Each equation of the model, read back as arithmetic, has our value at random states."""
+    plant, table, _, u, _ = case
+    write(plant, "modelica", tmp_path / "Plant.mo", table)
+    text = (tmp_path / "Plant.mo").read_text()
+    declared = dict(re.findall(r"parameter Real (\w+)(?:\([^)]*\))? = ([^; ]+)", text))
+    equations = re.split(r"\nequation\n", text)[1].rsplit("end Plant;", 1)[0]
+    equations = re.sub(
+        r"\(if ((?:[^()]|\([^()]*\))+) then 1\.0 else 0\.0\)", r"(1.0 if \1 else 0.0)", equations
+    )
+    rng = np.random.default_rng(1)
+    values = {k: float(v) for k, v in declared.items()} | {"time": 57.3}
+    values |= dict(zip(plant.inputs, map(float, u[len(u) // 2]), strict=True))
+    states = {n: float(rng.uniform(0.1, 30)) for n in plant.nodes}
+    known = {**values, **states, "t": 57.3}
+    known |= {p: values[p] if p in values else values[f"{p}_"] for p in plant.parameters}
+    values |= states | {f"{n}_": v for n, v in {**states, **known}.items()}
+
+    def table_of(x, xs, ys):
+        return float(np.interp(x, sorted(xs), [y for _, y in sorted(zip(xs, ys, strict=True))]))
+
+    scope = {f: getattr(np, f) for f in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh")}
+    scope |= {"min": min, "max": max, "delay": lambda value, seconds: value, "straightLines": table_of}
+    widths = {id(z): w for z, w in zip_widths(plant, table)}
+
+    def ours(e):
+        e = ex.substitute(e, lambda q: q.args[0] if q.op == "delay" else None)
+        return float(ex.evaluate(e, known, width=lambda jump: widths.get(id(argument(jump)), 0.0)))
+
+    for line in filter(None, map(str.strip, equations.split(";\n"))):
+        left, right = line.split(" = ", 1)
+        python = (
+            re.sub(r"\blambda\b", "lambda_", right).replace("^", "**").replace("{", "(").replace("}", ")")
+        )
+        found = float(eval(python, scope, values))
+        name = left.removesuffix("_")
+        if "der(" in left:
+            node = re.search(r"der\((\w+?)_?\)", left)[1]
+            expected = sum(
+                ours(f.rate) * ((f.target == node) - (f.source == node)) for f in plant.flows.values()
+            )
+            storage = float(eval(left.split(" * der(")[0].replace("{", "(").replace("}", ")"), scope, values))
+            assert storage == pytest.approx(ours(plant.nodes[node].storage), rel=1e-12)
+        elif name in plant.outputs:
+            expected = ours(plant.outputs[name].value)
+        else:
+            expected = ours(plant.flows[name.removeprefix("flow_") if name not in plant.flows else name].rate)
+            values[left] = expected
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-12), line
+
+
+def zip_widths(plant, table):
+    from thermoctl.export.values import values
+
+    equations = Equations(plant)
+    return [(z, w) for (z, _), w in zip(equations.jumps, values(plant, equations, table).width, strict=True)]
+
+
 def test_a_plant_that_needs_a_recording_says_so(tmp_path):
     with pytest.raises(
         InputError, match=r"reads first\(position\), an output: give a recording \(--data REC\)"
@@ -174,7 +235,7 @@ def test_a_plant_that_needs_a_recording_says_so(tmp_path):
         write(loads(FRICTION), "c", tmp_path / "plant.c")
 
 
-@pytest.mark.parametrize("to", ["fmu", "python", "c"])
+@pytest.mark.parametrize("to", ["fmu", "modelica", "python", "c"])
 def test_the_command(to, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     plant, dt = ALL["extended"]

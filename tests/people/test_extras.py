@@ -156,7 +156,7 @@ def test_a_mistake_is_found_without_a_drivers_package(tmp_path):
         ("rig", "devices probe /dev/null"),
         ("report", "calibrate --config config/simulated.yaml"),
         ("fmu", "plant check FMU"),
-        ("fleet", "diagnose --plant docs/examples/heater/plant.yaml docs/examples/heater --out FMU.out"),
+        ("fleet", "fleet s3://none/none"),
     ],
 )
 def test_a_command_says_what_it_lacks(extra, command, tmp_path):

@@ -14,11 +14,12 @@ from thermoctl.daemon import command_table as daemon
 from thermoctl.devices import command_table as devices
 from thermoctl.diagnosis import command_table as diagnose
 from thermoctl.export import command_table as export
+from thermoctl.fleet import command_table as fleet
 from thermoctl.identify import command_table as identify
 from thermoctl.plant import command_table as plant
 from thermoctl.recording import command_table as recording
 
-_TABLES = (daemon, joined, devices, recording, calibration, plant, advice, export, identify, diagnose)
+_TABLES = (daemon, joined, devices, recording, calibration, plant, advice, export, identify, diagnose, fleet)
 BY_PURPOSE: dict[str, tuple[Command, ...]] = {
     purpose: tuple(row for table in _TABLES for row in table.TABLE.get(purpose, ())) for purpose in PURPOSES
 }

@@ -1,1 +1,1 @@
-"""Plants for other programs: C, FMU, Python."""
+"""Plants for other programs: C, FMU, Python, Modelica."""

@@ -8,11 +8,11 @@ TABLE: Table = {
     MODEL: (
         command(
             "plant export",
-            "write a plant for other programs: FMU, Python, C",
+            "write a plant for other programs: FMU, Modelica, Python, C",
             "thermoctl.export.commands:export",
             "",
             argument("plant", metavar="PLANT"),
-            argument("--to", required=True, choices=["fmu", "python", "c"], help="the language"),
+            argument("--to", required=True, choices=["fmu", "modelica", "python", "c"], help="the language"),
             argument(
                 "--out",
                 metavar="FILE",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 import numpy as np
 
 from thermoctl.export.c import c_source
 from thermoctl.export.fmu import write_fmu
+from thermoctl.export.modelica import modelica_source
 from thermoctl.export.python import python_source
 from thermoctl.export.values import values
 from thermoctl.files.safe_file import write_text
@@ -19,7 +21,7 @@ from thermoctl.plant.simulation.equations import Equations
 from thermoctl.recording.foreign.logger import options
 from thermoctl.recording.table import Table
 
-SUFFIX = {"fmu": ".fmu", "python": ".py", "c": ".c"}
+SUFFIX = {"fmu": ".fmu", "modelica": ".mo", "python": ".py", "c": ".c"}
 
 
 def export(args: argparse.Namespace) -> int:
@@ -46,6 +48,8 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             f"{plant.file}: a plant that calls an FMU cannot be exported; write the effect into the FMU's own model"
         )
     numbers = values(plant, equations, recording)
+    name = re.sub(r"\W", "_", out.stem)
+    name = name if name[:1].isalpha() else f"plant_{name}"
     if to == "fmu":
         start = {}
         for i in plant.inputs.values() if recording else ():
@@ -54,4 +58,9 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             start[i.name] = float(column[np.isfinite(column)][0])
         write_fmu(plant, numbers, out, start)
         return
-    write_text(out, (python_source if to == "python" else c_source)(plant, numbers))
+    text = {
+        "modelica": lambda: modelica_source(plant, numbers, name),
+        "python": lambda: python_source(plant, numbers),
+        "c": lambda: c_source(plant, numbers),
+    }[to]()
+    write_text(out, text)

@@ -3,32 +3,51 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from thermoctl import __version__
+from thermoctl.export.text import Notation, unique, written
 from thermoctl.export.values import Values, first_outputs
 from thermoctl.plant import expression as ex
-from thermoctl.plant.expression import Expr, num
+from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.equations import Equations, argument
+from thermoctl.plant.simulation.equations import Equations
 
 _FUNCTIONS = {f: f"np.{f}({{0}})" for f in ("abs", "sqrt", "exp", "log", "sin", "cos", "tanh")}
-_FUNCTIONS |= {"min": "np.minimum({0}, {1})", "max": "np.maximum({0}, {1})"}
-_JUMPS = ("step", "sign", ">", ">=", "<", "<=")
-_LEVEL = {"+": 1, "*": 2, "/": 2, "neg": 1}
+
+
+def _jump(op: str, z: str, width: str) -> str:
+    if op == "sign":
+        return f"sign_({z}, {width})"
+    return f"step_({z}, {width}{', strict=True' if op in ('<', '>') else ''})"
+
+
+NOTATION = Notation(
+    "{0} ** {1}",
+    {**_FUNCTIONS, "min": "np.minimum({0}, {1})", "max": "np.maximum({0}, {1})"},
+    _jump,
+    {"==": "1.0 * ({0} == {1})", "!=": "1.0 * ({0} != {1})"},
+    lambda x, xs, ys: f"np.interp({x}, [{', '.join(xs)}], [{', '.join(ys)}])",
+)
 _RESERVED = {*keyword.kwlist, *keyword.softkwlist, "np", "solve_ivp", "sign_", "step_", *"txupwd", "first"}
 
 
 def python_source(plant: Plant, numbers: Values) -> str:
     """Return a Python file with the plant's equations and `simulate(t, inputs, parameters)`."""
     e = Equations(plant)
-    known = _unique(plant)
+    known = unique(plant, _RESERVED)
     names = {**known, **{d: d for d in (*e.input_delays, *e.output_delays)}, "t": "t"}
     site = {id(z): k for k, (z, _) in enumerate(e.jumps)}
 
     def text(expr: Expr) -> str:
         """Return an expression as Python text."""
-        return _written(expr, names, site)
+        return written(
+            expr,
+            NOTATION,
+            names.__getitem__,
+            lambda z: f"w[{site[id(z)]}]" if id(z) in site else "0.0",
+            lambda o: f"first[{o!r}]",
+        )
 
     def unpack(keys: Sequence[str], array: str) -> str:
         """Return the line that unpacks `array` into the names of `keys`; no line without keys."""
@@ -109,73 +128,6 @@ def output_delays(t, x, u, p, w):
     """Return (argument, seconds) of each delay in the outputs."""
 {get_x}{get_u}{get_p}    return {pairs(e.output_delays)}
 {_RUN}'''
-
-
-def _written(e: Expr, names: Mapping[str, str], site: Mapping[int, int], outer: int = 0) -> str:
-    """Return `e` in Python; in brackets where `outer`, the level of the operator around it, needs them.
-
-    `site`: the place in WIDTHS of each jump that is smoothed, by the id of its argument."""
-
-    def text(e: Expr, outer: int) -> str:
-        """Return an operand."""
-        return _written(e, names, site, outer)
-
-    a = e.args
-    if e.op == "num":
-        number = repr(e.value).removesuffix(".0")
-        return f"({number})" if e.value < 0 else number
-    if e.op == "name":
-        return names[str(e.value)]
-    if e.op == "first":
-        return f"first[{str(e.value)!r}]"
-    if e.op == "table":
-        points = [text(q, 0) for q in a[1:]]
-        return (
-            f"np.interp({text(a[0], 0)}, [{', '.join(points[: e.value])}], [{', '.join(points[e.value :])}])"
-        )
-    if e.op in _JUMPS:
-        z = argument(e)
-        width = f"w[{site[id(z)]}]" if id(z) in site else "0.0"
-        strict = ", strict=True" if e.op in ("<", ">") else ""
-        return f"{'sign_' if e.op == 'sign' else 'step_'}(({text(z, 0)}), {width}{strict})"
-    if e.op in ("==", "!="):
-        return f"1.0 * ({text(a[0], 3)} {e.op} {text(a[1], 3)})"
-    if e.op == "**":
-        return f"{text(a[0], 3)} ** {text(a[1], 3)}"
-    if e.op not in _LEVEL:
-        return _FUNCTIONS[e.op].format(*(text(q, 0) for q in a))
-    level = _LEVEL[e.op]
-    if e.op == "neg":
-        out = f"-{text(a[0], 2)}"
-    elif e.op == "+" and a[1].op == "neg":
-        out = f"{text(a[0], 1)} - {text(a[1].args[0], 2)}"
-    elif e.op == "+" and a[1].op == "num" and a[1].value < 0:
-        out = f"{text(a[0], 1)} - {text(num(-a[1].value), 2)}"
-    else:
-        out = f"{text(a[0], level)} {e.op} {text(a[1], level + (e.op != '+'))}"
-    return f"({out})" if outer > level or (outer == level and e.op == "neg") else out
-
-
-def _unique(plant: Plant) -> dict[str, str]:
-    """Return a name of each quantity and flow that no keyword and no other name is.
-
-    Flows have keys "flow NAME", outputs "output NAME": they may be called as another quantity."""
-    taken, names = set(_RESERVED), {}
-
-    def take(key: str, wanted: str) -> None:
-        """Keep a name for `key`: the wanted one, with `_` added until it is free."""
-        while wanted in taken:
-            wanted += "_"
-        taken.add(wanted)
-        names[key] = wanted
-
-    for name in (*plant.inputs, *plant.parameters, *plant.nodes):
-        take(name, name)
-    for name in plant.outputs:
-        take(f"output {name}", name)
-    for name in plant.flows:
-        take(f"flow {name}", name if name not in taken else f"flow_{name}")
-    return names
 
 
 def _parameters(plant: Plant, numbers: Values) -> str:

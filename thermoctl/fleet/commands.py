@@ -1,27 +1,104 @@
-"""`diagnose` on the recordings of many rigs, and of a running one."""
+"""The command `fleet`, and `diagnose` on the recordings of many rigs and of a running one."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from thermoctl.configuration.settings import load_settings
 from thermoctl.files.safe_file import make_folder
-from thermoctl.files.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.fleet import live
-from thermoctl.fleet.batch import Reporter, run_all
+from thermoctl.fleet.batch import Reporter, cluster, run_all
+from thermoctl.fleet.health import Summary, summarise
 from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.fleet.laws import comparisons, side_by_side
 from thermoctl.fleet.recordings import find_recordings, rig_of
+from thermoctl.fleet.trend import RigHealth, judge
 from thermoctl.plant import load
+
+
+def fleet(
+    folder: str,
+    plant: str | None = None,
+    parameters: str = "",
+    workers: int = 0,
+    scheduler: str | None = None,
+    as_json: bool = False,
+) -> int:
+    """Run `thermoctl fleet`: print the rigs of a folder; 1 when one needs attention.
+
+    `workers` 0: in this process. `scheduler`: the address of a Dask scheduler."""
+    names = tuple(n.strip() for n in parameters.split(",") if n.strip())
+    if names and plant is None:
+        raise InputError("--parameters: a plant was expected with --plant FILE")
+    ranged = [n for n, p in load(plant).parameters.items() if p.range is not None] if plant else []
+    for name in names:
+        if name not in ranged:
+            raise InputError(
+                f"{plant}: no parameter '{name}' with a range{suggest(name, ranged)}; expected some of "
+                f"{', '.join(ranged)}"
+            )
+    paths = find_recordings(folder)
+    if workers or scheduler:
+        with cluster(scheduler, workers) as client:
+            summaries = client.gather([client.submit(summarise, p, plant, names, pure=False) for p in paths])
+    else:
+        summaries = [summarise(p, plant, names) for p in paths]
+    rigs = judge(summaries)
+    if as_json:
+        print(json.dumps([_plain(asdict(r)) for r in rigs]))
+    else:
+        _show(rigs, names)
+    return int(any(r.advice for r in rigs))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _show(rigs: Sequence[RigHealth], names: Sequence[str]) -> None:
+    console = Console()
+    grid = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    grid.add_column("rig", no_wrap=True)
+    for title in ("files", "hours", "armed", "slips", "innov. K", "proof um", "misfit", *names):
+        grid.add_column(title, justify="right", min_width=5, overflow="fold")
+    for r in rigs:
+        good = [s for s in r.summaries if not s.error]
+        newest = good[-1] if good else Summary("", r.name, math.nan, math.nan)
+        grid.add_row(
+            r.name,
+            str(len(r.summaries)),
+            f"{sum(s.hours for s in good):.1f}",
+            _number(100 * newest.armed, "{:.0f} %"),
+            _number(newest.slips, "{:.0f}"),
+            _number(newest.innovation_c, "{:+.3f}"),
+            _number(newest.proof_um, "{:.3f}"),
+            _number(newest.misfit, "{:.1f}"),
+            *(_number(newest.estimates.get(p, (math.nan,))[0], "{:.3g}") for p in names),
+        )
+    console.print(grid)
+    for r in rigs:
+        for line in r.advice:
+            console.print(f"{r.name}: {line}", highlight=False, markup=False)
+
+
+def _number(value: float, text: str) -> str:
+    return text.format(value) if math.isfinite(value) else "-"
 
 
 @dataclass(frozen=True)

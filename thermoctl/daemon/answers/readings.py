@@ -1,6 +1,6 @@
 """Readings and faults as every view shows them: value, state, age, the device's message; causes first.
 
-`status`, `--json`, monitor, dashboard and metrics use them. An invalid reading has the value null;
+`status`, `--json`, monitor, dashboard, metrics and MQTT use them. An invalid reading has the value null;
 `readings` keeps its last value as `last`, with state and age.
 """
 

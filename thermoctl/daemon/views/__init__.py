@@ -1,1 +1,1 @@
-"""Views for people: dashboard, monitor, metrics and the demo."""
+"""Views for people: dashboard, monitor, metrics, MQTT and the demo."""
