@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.fit import DECADES, Placed
+from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.places import PLACES
@@ -23,8 +23,6 @@ HALF = 2.0  # largest gain of a refit that is reckoned with, over its first-orde
 ALIKE = 0.999  # limit of the cosine between two directions, so that their pair can be computed
 
 
-# The prior of a size takes log(SIZE root(promise)) off: its deviation over itself is 1 / root(2 promise).
-SIZE = float(2 * np.log(10.0) * DECADES / np.sqrt(np.pi))
 Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their predicted gain
 
 
@@ -69,11 +67,10 @@ def simpler(
 
 
 def predicted(d: Direction, promise: float, where: Mapping[str, set[str]], limits: Thresholds) -> float:
-    """Return the gain in score that a direction promises: its prior odds and that of its size are taken off.
+    """Return the gain in score that a direction promises: its prior odds are taken off.
 
-    A size that the data tell within a share of itself loses the logarithm of that share (fit.py)."""
-    size = 0.0 if d.candidate.effect.prior else np.log(SIZE * np.sqrt(max(promise, 1.0)))
-    return float(promise + odds((Placed(d.candidate, {}),), where, limits) - size)
+    The prior of its size, 2 to 5 nats, is not: a first-order promise of a limit or a lag is too low by more."""
+    return float(promise + odds((Placed(d.candidate, {}),), where, limits))
 
 
 def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Thresholds) -> list[Extension]:
