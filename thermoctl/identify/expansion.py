@@ -162,7 +162,7 @@ class Bank:
         """Rotate the waiting rows into the triangles."""
         if self.waiting:
             rows = np.concatenate([self.triangles, np.stack(self.waiting, axis=1)], axis=1)
-            self.triangles = np.linalg.qr(rows, mode="r")
+            self.triangles = np.asarray(np.linalg.qr(rows, mode="r"))
             self.waiting = []
 
     def bounded(self, low: np.ndarray | float, high: np.ndarray | float) -> Expansion:

@@ -86,9 +86,9 @@ def _response(
 ) -> np.ndarray:
     """Return the rows of a recording's responses (rows, count) to first-order changes."""
     d, point = problem.excitations[r], (values, dx0)
-    pushes, buffers = (pushed.forces, pushed.q, count), problem.buffers
+    model, buffers = problem.model, problem.buffers
     dy = (
-        problem.model.respond(d, *point, *pushes, buffers=buffers)
+        model.respond(d, *point, pushed.forces, pushed.q, count, buffers=buffers)
         if pushed.forces
         else np.zeros((*d.y.shape, count))
     )

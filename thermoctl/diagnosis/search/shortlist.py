@@ -56,7 +56,7 @@ def simpler(
     """Return the simpler entries at the places of `added`, to try instead of an insignificant effect.
 
     The entry that an effect contains may gain as much as this one, others what they promise themselves."""
-    out = []
+    out: list[Extension] = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         here = [a.candidate.effect for a in added if a.candidate.place.where == d.candidate.place.where]
         if d.gain > 0 and any(d.candidate.effect.name == a.contains for a in here):

@@ -105,7 +105,7 @@ class Code(Equations):
             ints("V_ROW", [i for i, _, _ in sens], ""),
             ints("V_COL", [c for _, c, _ in sens], ""),
             *(
-                ints(f"O{o}_{what}", [e[at] for e in lists[o][1]], "")
+                ints(f"O{o}_{what}", [e[:3][at] for e in lists[o][1]], "")
                 for o in (0, 1)
                 for at, what in enumerate(("ROW", "KIND", "COL"))
             ),
