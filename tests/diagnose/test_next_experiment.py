@@ -59,13 +59,16 @@ def undecided():
 
 
 def shared_by_two(belief, truth, inputs):
-    """A diagnosis that two refitted hypotheses share equally, without the rest of the search."""
+    """A diagnosis that two refitted hypotheses share equally: each entry is searched alone, so that both are refitted."""
     table = compile_plant(loads(truth), ()).measure(inputs, seed=1)
     two = ("radiation", "temperature_dependent_conductance")
     entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in two}
     known = case(loads(belief), [table], entries, Budget(30))
     numbers = dataclasses.replace(limits(), effects=1)
-    searched = search(known, numbers)
+    one, other = (search(dataclasses.replace(known, catalogue={k: entries[k]}), numbers) for k in two)
+    searched = dataclasses.replace(
+        one, tried=(*one.tried, *(w for w in other.tried if w.fitted.hypothesis.keys))
+    )
     single = [w.fitted.hypothesis.keys for w in searched.tried if w.fitted.hypothesis.keys]
     assert {e for keys in single for e, _ in keys} == set(two)
     best = [next(k for k in single if e in {n for n, _ in k}) for e in two]

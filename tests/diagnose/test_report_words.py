@@ -188,7 +188,7 @@ def test_terminal_report_and_reasons_show_the_same_digits(found):
     ]
     for text in told:
         plain = re.sub(r"enters at.*", "", text)
-        for digits in re.findall(rf"(?<![\w.]){NUMBER}(?= K\b| V\b| of | after|[ .;)])", plain):
+        for digits in re.findall(rf"(?<![\w.]){NUMBER}(?= K\b| V\b| of | after|[ ;),]|\.(?!\d))", plain):
             assert digits.rstrip(".") in every, (digits, text, every)
 
 

@@ -159,7 +159,11 @@ def test_an_effect_changes_a_plant_alike_in_degc_and_in_kelvin():
         for one, other in zip(parts, absolute[key], strict=True):
             assert one.keys() == other.keys()
             for k in one:
-                np.testing.assert_allclose(other[k], one[k], rtol=1e-6, atol=1e-9, err_msg=str(key))
+                # the two take other steps, each with a small error of its own
+                scale = float(np.abs(one[k]).max())
+                np.testing.assert_allclose(
+                    other[k], one[k], rtol=1e-6, atol=1e-9 + 1e-6 * scale, err_msg=str(key)
+                )
 
 
 def test_an_effect_of_heat_has_the_unit_of_the_plants_heat_flows():

@@ -155,7 +155,7 @@ def test_the_sensitivity_to_a_start_decays_to_zero(plant):
     month = dataclasses.replace(table, t=100 * table.t)
     run = compile_plant(plant).simulate(month, sensitivities=True)
     assert run.dx is not None
-    assert run.dx[1, 0, -1] > 0.9 and run.dx[-1, 0, -1] == 0.0
+    assert run.dx[1, 0, -1] > 0.9 and abs(run.dx[-1, 0, -1]) < 1e-300
 
 
 def test_white_noise_of_a_thousand_outputs_needs_no_row(plant):
