@@ -69,7 +69,7 @@ def simpler(
 def predicted(d: Direction, promise: float, where: Mapping[str, set[str]], limits: Thresholds) -> float:
     """Return the gain in score that a direction promises: its prior odds are taken off.
 
-    The prior of its size, 2 to 5 nats, is not: a first-order promise of a limit or a lag is too low by more."""
+    That of its size, 2 to 5 nats, stays: first-order promises of limits and lags err by more."""
     return float(promise + odds((Placed(d.candidate, {}),), where, limits))
 
 
