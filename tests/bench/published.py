@@ -10,8 +10,8 @@ weak        PySINDy's weak form on the readings themselves, polynomials to the t
 paper       what the paper did, for those of Ebers, Steele, Kutz: low-pass filter of 4 Hz, differences, STLSQ with 0.046
 
 The first three peers get the true place and the flow that our tracking smooths, the last two the true parameters, too.
-`right`: along the held-out run the rates dx/dt at all places that lack something are closer than EQUAL of the error
-of the refitted plant file, and nothing is named that is not missing. `rate`: that share, the worst place's.
+`rate`: error of the rates dx/dt along the held-out run, over that of the refitted plant file, at the worst place that
+lacks something. `right`: it is below EQUAL, and nothing is named that is not missing.
 `coefficient`: largest relative error of the true form's coefficients, when the form is fitted to the rates found.
 `held out`: rms error of the forecast of the held-out run from its true start over that of the refitted plant file;
 `window` forecasts each of a chaotic system."""

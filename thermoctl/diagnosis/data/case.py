@@ -133,12 +133,10 @@ class Case:
 
 
 def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
-    """Return where a part's states start, by the states of a model that has more.
+    """Return where a part's states start, for a model with further states than `of`.
 
-    NaN: the plant states it.
-
-    A further state starts from its own reading. Without one it starts like the node that it exchanges
-    with, if the plant states the same initial value for both."""
+    A further state starts from its own reading. Without one it starts like the node that it exchanges with,
+    if the plant states the same initial value for both. NaN stands for the plant's initial value."""
     if d.x0 is None:
         return None
     known = dict(zip(of, d.x0, strict=True))
