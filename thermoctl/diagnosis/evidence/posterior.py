@@ -93,7 +93,15 @@ def _slopes(
     run = problem.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
     used, unknowns, slope = problem.slopes(r, values)
     assert run.dy is not None
-    return d.y - run.y, unknowns, [transform(c, run.dy[:, c.output, used]) * slope for c in channels]
+    return d.y - run.y, unknowns, [_slope_rows(c, run.dy, used, slope) for c in channels]
+
+
+def _slope_rows(c: Channel, dy: np.ndarray, used: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return a channel's slopes (rows, k) by its unknowns, from those of all outputs (N, outputs, q)."""
+    own = dy[:, c.output]
+    rows = transform(c, own if len(used) == own.shape[1] else own[:, used])
+    rows *= slope
+    return rows
 
 
 def _sums(
@@ -134,7 +142,7 @@ def _simulated_sums(
     used, unknowns, slope = problem.slopes(r, values)
     assert run.dy is not None
     dy = run.dy  # copied one channel at a time: a recording has megabytes
-    slopes = (transform(c, dy[:, c.output, used]) * slope for c in channels)
+    slopes = (_slope_rows(c, dy, used, slope) for c in channels)
     return _sums(channels, unknowns, slopes, rows, inverse, True)
 
 
