@@ -55,6 +55,7 @@ def core(plant: Plant, e: Equations, numbers: Values, title: str = "") -> str:
         f'#define INPUTS "{",".join(plant.inputs)}"\n#define OUTPUTS "{",".join(e.outputs)}"',
         f"static void rhs_{ARGUMENTS}, double *out) {{\n{e.emit(e.slopes)}}}",
         f"static void jac_{ARGUMENTS}, double *out) {{\n{slopes}}}",
+        f"static void rhs_jac_{ARGUMENTS}, double *out) {{ rhs_(t, x, u, p, w, out); jac_(t, x, u, p, w, out + NX); }}",
         f"static void outputs_{ARGUMENTS}, const double *d, double *out) {{\n{e.emit(e.values, 't x u p w d')}}}",
         f"static void delayed_{ARGUMENTS}, const double *d, double *out) {{\n"
         f"{e.emit([g for g, _ in late], 't x u p w d out')}}}",

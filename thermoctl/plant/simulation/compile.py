@@ -111,6 +111,9 @@ class Code(Equations):
             ),
             f"void rhs_{args}, double *out) {{\n{self.emit(self.slopes)}}}\n",
             f"void jac_{args}, double *out) {{\n{self.emit([d for *_, d in jac])}}}\n",
+            ""
+            if self.linear
+            else f"void rhs_jac_{args}, double *out) {{\n{self.emit([*self.slopes, *(d for *_, d in jac)])}}}\n",
             f"void sens_{args}, double *out) {{\n{self.emit([d for *_, d in ([] if self.linear else jac) + sens])}}}\n",
         ]
         for (values, entries), fn in zip(lists, ("outputs_", "delayed_"), strict=True):

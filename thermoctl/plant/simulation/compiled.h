@@ -11,6 +11,7 @@ extern const int NO0, O0_ROW[], O0_KIND[], O0_COL[], NO1, O1_ROW[], O1_KIND[], O
 extern const int NM;                                                          /* of the factors of I - a df/dx */
 void rhs_(AT, double *out);
 void jac_(AT, double *out);
+void rhs_jac_(AT, double *out);                                               /* both, unless df/dx is constant */
 void sens_(AT, double *out);                                                  /* df/dx, unless it is constant, then df/dq */
 void outputs_(AT, const double *d, double *out), outputs_slopes_(AT, const double *d, double *out);
 void delayed_(AT, const double *d, double *out), delayed_slopes_(AT, const double *d, double *out);

@@ -204,10 +204,11 @@ class Equations:
 
 PRELUDE = """#include <math.h>
 /* Half width w of a jump: 0 none; -1 and -2: latched before and after it, between the events of an FMU. */
-static inline double sign_(double z, double w) { return w > 0 ? tanh(z / w) : w < 0 ? (w < -1.5) - (w > -1.5) : (z > 0) - (z < 0); }
-static inline double step_(double z, double w) { return w > 0 ? 0.5 * (1 + tanh(z / w)) : w < 0 ? w < -1.5 : z >= 0; }
-static inline double strict_(double z, double w) { return w > 0 ? 0.5 * (1 + tanh(z / w)) : w < 0 ? w < -1.5 : z > 0; }
-static inline double bump_(double z, double w) { if (!(w > 0)) return 0; double q = tanh(z / w); return 0.5 / w * (1 - q * q); }
+static inline double smooth_(double q) { return fabs(q) < 20 ? tanh(q) : q > 0 ? 1 : q < 0 ? -1 : q; }
+static inline double sign_(double z, double w) { return w > 0 ? smooth_(z / w) : w < 0 ? (w < -1.5) - (w > -1.5) : (z > 0) - (z < 0); }
+static inline double step_(double z, double w) { return w > 0 ? 0.5 * (1 + smooth_(z / w)) : w < 0 ? w < -1.5 : z >= 0; }
+static inline double strict_(double z, double w) { return w > 0 ? 0.5 * (1 + smooth_(z / w)) : w < 0 ? w < -1.5 : z > 0; }
+static inline double bump_(double z, double w) { if (!(w > 0)) return 0; double q = smooth_(z / w); return 0.5 / w * (1 - q * q); }
 static inline double min_(double a, double b) { return a < b ? a : b; }
 static inline double max_(double a, double b) { return a > b ? a : b; }
 static inline double dpow_(double a, double b) { return a > 0 ? pow(a > 1e-8 ? a : 1e-8, b - 1) : 0; }

@@ -1,5 +1,5 @@
 /* One step of an implicit integrator. The including file defines the sizes NX, NU, NJ, NM and LINEAR, and the functions rhs_,
-   jac_, factor_ and solve_.
+   jac_, rhs_jac_, factor_ and solve_.
 
    ESDIRK4(3)6L[2]SA of Kennedy & Carpenter, Appl. Numer. Math. 44 (2003) 139-181: order 4, six stages, first one
    explicit, L-stable, stiffly accurate, embedded order 3. Each stage X_i solves X_i = base_i + h g f(X_i) by Newton with
@@ -21,6 +21,11 @@ static const double A_[STAGES][STAGES] = {
 static const double BHAT[STAGES] = {4586570599.0 / 29645900160.0, 0, 178811875.0 / 945068544, 814220225.0 / 1159782912,
                                     -3700637.0 / 11593932, 61727.0 / 225920};
 
+/* In place of fmin, fmax and pow, which are calls of the C library. */
+static inline double lesser_(double a, double b) { return a < b ? a : b; }
+static inline double larger_(double a, double b) { return a > b ? a : b; }
+static inline double root4_(double a) { return sqrt(sqrt(a)); }
+
 static void inputs_at(double s, const double *u0, const double *u1, const int *lin, double *u) {
   for (int j = 0; j < NU; j++) u[j] = u1 && lin[j] ? u0[j] + s * (u1[j] - u0[j]) : u0[j];
 }
@@ -28,7 +33,7 @@ static void inputs_at(double s, const double *u0, const double *u1, const int *l
 static double norm_(const double *e, const double *x, const double *xn, double rtol, const double *atol) {
   double worst = 0;
   for (int i = 0; i < NX; i++) {
-    double q = fabs(e[i]) / (atol[i] + rtol * 1e-3 * fmax(fabs(x[i]), fabs(xn[i])));
+    double q = fabs(e[i]) / (atol[i] + rtol * 1e-3 * larger_(fabs(x[i]), fabs(xn[i])));
     if (!(q <= worst)) worst = q;          /* a NaN is kept */
   }
   return worst;
@@ -39,7 +44,7 @@ static double norm_(const double *e, const double *x, const double *xn, double r
 static double try_step(double t, double h, double ta, double dt, const double *u0, const double *u1, const int *lin,
                        const double *p, const double *w, const double *x, double rtol, const double *atol,
                        double *k, double *xs, double *xn, double *M, double *hfac) {
-  double u[NU + 1], J[NJ + 1], f[NX + 1], r[NX + 1];
+  double u[NU + 1], f[NX + NJ + 1], r[NX + 1], *const J = f + NX;
   inputs_at((t - ta) / dt, u0, u1, lin, u);
   memcpy(xs, x, NX * sizeof(double));
   rhs_(t, x, u, p, w, k);
@@ -55,10 +60,10 @@ static double try_step(double t, double h, double ta, double dt, const double *u
     double last = 1e300;
     int it, done = 0;
     for (it = 0; it < 12 && !done; it++) {
-      rhs_(ts, X, u, p, w, f);
+      if (LINEAR) rhs_(ts, X, u, p, w, f); else rhs_jac_(ts, X, u, p, w, f);
       for (int i = 0; i < NX; i++) r[i] = base[i] + h * G * f[i] - X[i];
       if (!LINEAR || *hfac != h) {
-        jac_(ts, X, u, p, w, J);
+        if (LINEAR) jac_(ts, X, u, p, w, J);
         if (!factor_(h * G, J, M)) return -1;
         *hfac = h;
       }
@@ -97,13 +102,13 @@ static int advance_states_(double ta, double dt, const double *u0, const double 
     if (++steps > 100000) return 1;
     double err = try_step(ta + at, s, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
     if (!(err >= 0 && err <= 1)) {
-      *want = err > 1 && err < 1e9 ? s * fmax(0.1, 0.9 * pow(err, -0.25)) : s * 0.1;
+      *want = err > 1 && err < 1e9 ? s * larger_(0.1, 0.9 / root4_(err)) : s * 0.1;
       if (*want < 1e-12 * dt) return 1;
       continue;
     }
     memcpy(x, xn, NX * sizeof(double));
-    double grow = s * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
-    *want = s < left ? grow : fmax(*want, grow);
+    double grow = s * lesser_(4, 0.9 / root4_(larger_(err, 1e-6)));
+    *want = s < left ? grow : larger_(*want, grow);
     at = s >= left ? dt : at + s;
   }
   return 0;

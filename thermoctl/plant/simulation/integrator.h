@@ -5,6 +5,9 @@
    esdirk.h takes those where its error does not pass or the plant is stiff. Sensitivities S = dx/dq are the exact derivative
    of the step that was taken; of ESDIRK's
        (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
+#if NX > 2 /* slopes take a sixth less time, and most of a refit; a run of two states would take longer */
+#pragma GCC optimize("O2", "no-tree-vectorize")
+#endif
 #include "compiled.h"
 #include "esdirk.h"
 
@@ -158,7 +161,7 @@ static double steepest_(const double *J, double h, double *z) {
     for (int i = 0; i < NX; i++) { double a = y[i] / better[i]; if (!(a <= bound)) bound = a; }
     if (h * bound <= STEEP) { if (round) memcpy(z, better, NX * sizeof(double)); break; }
     if (!(bound < 1e300)) break;
-    for (int i = 0; i < NX; i++) better[i] = fmax(0.5 * (better[i] + y[i] / bound), 1e-250);
+    for (int i = 0; i < NX; i++) better[i] = larger_(0.5 * (better[i] + y[i] / bound), 1e-250);
   }
   return bound;
 }
@@ -169,8 +172,8 @@ static int sticks_(double h, const double *k0, const double *k1, const double *x
   double slope = 0, way = 0;
   for (int i = 0; i < NX; i++) {
     const double d = h * fabs(k1[i] - k0[i]);
-    if (d > 1e-2 * atol[i]) slope = fmax(slope, d / z[i]);
-    way = fmax(way, fabs(x1[i] - x0[i]) / z[i]);
+    if (d > 1e-2 * atol[i]) slope = larger_(slope, d / z[i]);
+    way = larger_(way, fabs(x1[i] - x0[i]) / z[i]);
   }
   return slope > 4 * STEEP * way;
 }
@@ -180,21 +183,23 @@ static int sticks_(double h, const double *k0, const double *k1, const double *x
 static double try_explicit(double t, double *h, double least, double ta, double dt, const double *u0, const double *u1, const int *lin,
                            const double *p, const double *w, const double *x, double rtol, const double *atol,
                            double *xs, double *xn, double *z, double *steep) {
-  double u[NU + 1], e[NX + 1], k[POINTS + 1][NX + 1], J[NJ + 1];
+  double u[NU + 1], e[NX + 1], k[POINTS + 1][NX + 1], first[NX + NJ + 1];
   for (int s = 0; s <= POINTS; s++) {
     const double ts = t + RC_[s] * *h;
     double *const X = xs + s * NX;
     inputs_at((ts - ta) / dt, u0, u1, lin, u);
     if (s == 0) {
       memcpy(X, x, NX * sizeof(double));
-      if (!LINEAR || *steep < 0) { jac_(ts, x, u, p, w, J); *steep = steepest_(J, *h, z); }
+      if (!LINEAR) rhs_jac_(ts, x, u, p, w, first);
+      else if (*steep < 0) jac_(ts, x, u, p, w, first + NX);
+      if (!LINEAR || *steep < 0) *steep = steepest_(first + NX, *h, z);
       if (!(*h * *steep <= STEEP)) {
         *h /= ceil(*h * *steep / STEEP);
         if (!(*h >= least)) return -1;
       }
     } else if (s < POINTS) for (int i = 0; i < NX; i++) X[i] = x[i] + *h * RC_[s] * k[s - 1][i];
     else for (int i = 0; i < NX; i++) X[i] = x[i] + *h * (RA_[0] * k[0][i] + RA_[1] * k[1][i] + RA_[2] * k[2][i] + RA_[3] * k[3][i]);
-    rhs_(ts, X, u, p, w, k[s]);
+    if (LINEAR || s) rhs_(ts, X, u, p, w, k[s]); else memcpy(k[0], first, NX * sizeof(double));
     if (!LINEAR && (s == 1 || s == 3) && sticks_(*h, k[s - 1], k[s], X - NX, X, z, atol)) return -1;
   }
   for (int i = 0; i < NX; i++) {
@@ -303,17 +308,17 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       else {
         const double wished = h;
         double err = try_explicit(at, &h, wished * SHORT, ta, dt, u0, u1, lin, p, w, x, rtol, atol, xs, xn, z, &steep);
-        double grow = h * fmin(8, 0.9 * pow(fmax(err, 1e-4), -0.25));
+        double grow = h * lesser_(8, 0.9 / root4_(larger_(err, 1e-4)));
         if (err >= 0 && err <= 1 && (!nc || sens_explicit(at, h, ta, dt, u0, u1, lin, p, w, xs, z, &c, force, n))) {
           memcpy(x, xn, NX * sizeof(double));
           info[0]++;
-          reach = h < left ? grow : fmax(reach, grow);
+          reach = h < left ? grow : larger_(reach, grow);
           at = h < left ? at + h : t[n + 1];
           wait = 1;
           continue;
         }
         if (err > 1 && err < 1e9 && grow > 1e-9 * dt) { reach = grow; info[1]++; continue; }
-        if (wished < left) want = want <= 0 ? wished : fmin(want, wished);
+        if (wished < left) want = want <= 0 ? wished : lesser_(want, wished);
         skip = wait;
         if (wait < LONGEST_WAIT) wait *= 2;
       }
@@ -326,15 +331,15 @@ int integrate(int N, const double *t, const double *U, const int *lin, const dou
       double err = try_step(at, h, ta, dt, u0, u1, lin, p, w, x, rtol, atol, k, xs, xn, M, &hfac);
       if (!(err >= 0 && err <= 1)) {
         info[1]++;
-        want = err > 1 && err < 1e9 ? h * fmax(0.1, 0.9 * pow(err, -0.25)) : h * 0.1;
+        want = err > 1 && err < 1e9 ? h * larger_(0.1, 0.9 / root4_(err)) : h * 0.1;
         if (want < 1e-12 * dt || ++failed > 60) { failed_at = n + 1; goto out; }
         continue;
       }
       if (nc && !sens_step(at, h, ta, dt, u0, u1, lin, p, w, xs, &c, Ms, &hfac_s, force, n)) { failed_at = n + 1; goto out; }
       memcpy(x, xn, NX * sizeof(double));
       info[0]++;
-      double grow = h * fmin(4, 0.9 * pow(fmax(err, 1e-6), -0.25));
-      if (!last || grow < want || want <= 0) want = grow; else want = fmax(want, grow);
+      double grow = h * lesser_(4, 0.9 / root4_(larger_(err, 1e-6)));
+      if (!last || grow < want || want <= 0) want = grow; else want = larger_(want, grow);
       at = last ? t[n + 1] : at + h;
     }
     memcpy(X + (size_t)(n + 1) * NX, x, NX * sizeof(double));
