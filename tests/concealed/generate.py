@@ -144,9 +144,9 @@ class Bench:
             for row in starts
         ]
 
-    def tangents(self, x: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    def tangents(self, x: np.ndarray, rough: bool = False) -> tuple[list[np.ndarray], np.ndarray]:
         """Readings (N, ny) by run at x (np,), and their whitened derivatives (np, M) by the parameters and by the starts of
-        each run."""
+        each run; `rough`: derivatives from fewer volumes."""
         n, ns, runs = len(self.scene.ranges), len(self.scene.starts), range(len(self.scene.runs))
         h = np.append(np.full(n, 4 * STEP), np.full(ns, 0.1))
         base, moved = [], []
@@ -154,9 +154,9 @@ class Bench:
             points = np.tile(x, (1 + n + ns, 1))
             own = np.append(np.arange(n), n + k * ns + np.arange(ns))
             points[1 + np.arange(n + ns), own] += h
-            y = self.scene.outputs_of(k, [self._variants(p)[k] for p in points])
-            base.append(y[0])
-            moved.append((y[1:] - y[:1]) / h[:, None, None])
+            rows = [self._variants(p)[k] for p in points]
+            base.append(self.scene.outputs_of(k, rows[:1])[0])
+            moved.append(self.scene.changes_of(k, rows, rough) / h[:, None, None])
         whole = [self.judge.whiten([d[:n] for d in moved])]
         for k in runs:  # each run has its own start
             whole.append(
@@ -202,7 +202,7 @@ class Bench:
         def at(x: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
             """Residual and slopes, turned so that all but np + 1 rows are zero: the steps are those of the whole."""
             # a truth takes as long for one variant as for thirty: the slopes come with the readings
-            base, slopes = self.tangents(np.array(x))
+            base, slopes = self.tangents(np.array(x), True) if any(x) else (self.base, self.derivatives)
             left[x] = np.append(self.off(readings, base), x)
             whole = np.empty((len(left[x]), free + 1), order="F")
             whole[:-free, :-1], whole[-free:, :-1], whole[:, -1] = -slopes.T, np.eye(free), left[x]
@@ -235,7 +235,7 @@ class Bench:
                 for s in part
                 for z in (0.1, 1)
             ]
-            d = [self.scene.outputs_of(k, rows) - self.base[k] for k in range(len(self.scene.runs))]
+            d = [self.scene.changes_of(k, [Variant(), *rows], True) for k in range(len(self.scene.runs))]
             left = self.judge.left_over(self.judge.whiten(d))
             for i, s in enumerate(part):
                 for row, signal in zip(found, signals, strict=True):

@@ -10,6 +10,8 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
+DEF FEW_ROWS = 16
+
 
 # ------------------------------------------------------------------------------------------ thermal networks
 def thermal(modes, v, run, double[:, :, ::1] out):
@@ -20,7 +22,7 @@ def thermal(modes, v, run, double[:, :, ::1] out):
     cdef:
         int rows = out.shape[0], samples = out.shape[1], nb = out.shape[2]
         int n = modes.rate.shape[0], ne = len(modes.g0), nj = len(v.heat_body), nl = len(v.links)
-        bint g_varies = v.g_varies, c_varies
+        bint g_varies = v.g_varies
         double melt_at = run.get("melt_at", 0.0)
         double[::1] t = np.ascontiguousarray(run["t"], float), air = np.ascontiguousarray(run["air"], float)
         double[::1] speed = _track(run, "velocity"), place = _track(run, "position"), base = _track(run, "base")
@@ -40,152 +42,171 @@ def thermal(modes, v, run, double[:, :, ::1] out):
         int[:, ::1] ends = np.array([u[:3] for u in v.links] or [[-1, 0, 0]], np.intc)  # row, body, body
         double[::1] link_g = np.array([u[3] for u in v.links] or [0.0], float)
         unsigned char[:, ::1] need = v.needed(modes)  # temperatures (m, 2 bodies) that a row's forces read
-        double[:, ::1] scratch = np.zeros((11, max(n, 2 * nb + 1, ne)))
-        double *z = &scratch[0, 0]
-        double *z1 = &scratch[1, 0]
-        double *f0 = &scratch[2, 0]
-        double *f1 = &scratch[3, 0]
-        double *seen = &scratch[4, 0]      # surface temperatures, then means
-        double *watts = &scratch[5, 0]     # at the surfaces, then spread over the bodies
-        double *net = &scratch[6, 0]
-        double *heat = &scratch[7, 0]
-        double *fan_on = &scratch[8, 0]
-        double *hid = &scratch[9, 0]       # hidden masses, then their predicted values
-        double *hid_rate = &scratch[10, 0]
+        bint[:, ::1] plain = np.array(v.g == modes.g0, np.intc)  # flows (m, flows) as in the truth
+        bint[:, ::1] foreign = np.zeros((rows, nb), np.intc)  # bodies (m, bodies) with a heat of their own
+        bint[::1] resized = np.zeros(rows, np.intc)
+        double[:, ::1] zs = np.array(start), z1s = np.zeros((rows, n)), f0s = np.zeros((rows, n))
+        double[:, ::1] temps = np.zeros((rows, 2 * nb))  # surface temperatures, then means
+        double[:, ::1] hids = np.zeros((rows, 2 * nb)), hid_rates = np.zeros((rows, 2 * nb))  # and predicted ones
+        double[:, ::1] fans = np.zeros((rows, ne))
+        double[:, ::1] scratch = np.zeros((4, max(n, 2 * nb + 1)))
+        double *f1 = &scratch[0, 0]
+        double *watts = &scratch[1, 0]     # at the surfaces, then spread over the bodies
+        double *net = &scratch[2, 0]
+        double *heat = &scratch[3, 0]
+        double *z = NULL
+        double *z1 = NULL
+        double *f0 = NULL
+        double *seen = NULL
+        double *hid = NULL
+        double *hid_rate = NULL
+        double *fan_on = NULL
         double *f = NULL
         double *d = NULL
         double *now_z = NULL
         double *now_hid = NULL
         double ts, other, now, room, flux, linear, cond, w, rise, x, share, storage, h = 0.0
-        int r, k, s, i, j, e, l, body
+        int r, k, s, i, j, e, l, body, first
+        bint c_varies
 
     for r in range(rows):
-        memcpy(z, &start[r, 0], n * sizeof(double))
-        memcpy(hid, &cool[r, 0], nb * sizeof(double))
-        memset(fan_on, 0, ne * sizeof(double))
-        memset(seen, 0, 2 * nb * sizeof(double))
-        c_varies = False
+        memcpy(&hids[r, 0], &cool[r, 0], nb * sizeof(double))
         for i in range(nb):
-            if c[r, i] != c0[i] or cap[r, i] != 0 or melt[r, i] != 0:
-                c_varies = True
+            resized[r] |= c[r, i] != c0[i] or cap[r, i] != 0 or melt[r, i] != 0
+            foreign[r, i] = (rad[r, i] != 0 or nat[r, i] != 0 or q[r, i] != 0 or eddy[r, i] != 0 or hyst[r, i] != 0
+                             or based[r, i] != 0 or burst[r, i] != 0 or hid_g[r, i] != 0 or hid_air[r, i] != 0)
+        for e in range(ne):
+            plain[r, e] &= not (g_varies and (temp[r, e] != 0 or step[r, e] != 0 or forced[r, e] != 0
+                                              or pos[r, e] != 0 or fan[r, e] != 0))
+    # a few rows at a time: their modes, and a sample's factors, stay in the fastest cache
+    for first in range(0, rows, FEW_ROWS):
         for k in range(samples):
-            for s in range(2):  # the two stages of ETD2RK
-                if s == 0:
-                    now_z, now_hid, f, d, room, now = z, hid, f0, hid_rate, air[k], t[k] - t[0]
-                else:
-                    now_z, now_hid, f, d, room = z1, hid + nb, f1, hid_rate + nb, air[k + 1]
-                    now = t[k + 1] - t[0] - 1e-9
-                for i in range(2 * nb):
-                    if need[r, i] or (s == 0 and i >= nb):
-                        x = 0.0
-                        for j in range(n):
-                            x += now_z[j] * push[i, j]
-                        seen[i] = x
-                if s == 0:
-                    for i in range(nb):
-                        out[r, k, i] = seen[nb + i]
-                    if k == samples - 1:
-                        break
-                # flows between surfaces
-                for i in range(nb):
-                    watts[i] = net[i] = heat[i] = 0.0
-                for e in range(ne):
-                    ts = seen[a[e]]
-                    other = seen[b[e]] if b[e] < nb else room
-                    cond = g[r, e]
-                    if g_varies:
-                        if temp[r, e] != 0:
-                            cond *= fmax(1 + temp[r, e] * (ts - 20), 0.05)
-                        if step[r, e] != 0:
-                            cond *= 1 + step[r, e] * (now >= t0[r, 0])
-                        if forced[r, e] != 0:
-                            cond *= 1 + forced[r, e] * sqrt(fabs(speed[k]))
-                        if pos[r, e] != 0:
-                            cond *= 1 + pos[r, e] * place[k]
-                        if fan[r, e] != 0:
-                            x = ts - air[k]
-                            fan_on[e] = 1.0 if x > 8 else 0.0 if x < 5 else fan_on[e]
-                            cond *= 1 + fan[r, e] * fan_on[e]
-                    flux = cond * (ts - other)
-                    if b[e] < nb:
-                        linear = (cond - g0[e]) * (ts - other)
-                        net[b[e]] += flux
-                        watts[b[e]] += linear
+            for r in range(first, min(first + FEW_ROWS, rows)):
+                z, z1, f0, seen, fan_on = &zs[r, 0], &z1s[r, 0], &f0s[r, 0], &temps[r, 0], &fans[r, 0]
+                hid, hid_rate, c_varies = &hids[r, 0], &hid_rates[r, 0], resized[r]
+                for s in range(2):  # the two stages of ETD2RK
+                    if s == 0:
+                        now_z, now_hid, f, d, room, now = z, hid, f0, hid_rate, air[k], t[k] - t[0]
                     else:
-                        linear = (cond - g0[e]) * ts - cond * other
-                    net[a[e]] -= flux
-                    watts[a[e]] -= linear
-                # foreign heat at the surfaces; `net` collects all that comes in
-                for i in range(nb):
-                    ts = seen[i]
-                    rise = ts - room
-                    w = 0.0
-                    if rad[r, i] != 0:
-                        x, share = (ts + 273.15) * (ts + 273.15), (room + 273.15) * (room + 273.15)
-                        w -= rad[r, i] * (x * x - share * share)
-                    if nat[r, i] != 0:
-                        w -= nat[r, i] * rise * sqrt(sqrt(fabs(rise)))
-                    if q[r, i] != 0:
-                        w += q[r, i] * (now >= t0[r, 0] and now < t1[r, 0])
-                    if eddy[r, i] != 0:
-                        w += eddy[r, i] * speed[k] * speed[k]
-                    if hyst[r, i] != 0:
-                        w += hyst[r, i] * fabs(speed[k])
-                    if based[r, i] != 0:
-                        w -= based[r, i] * (ts - base[k])
-                    if burst[r, i] != 0:
-                        w -= burst[r, i] * fmax(rise - 4, 0.0) * (fmod(now, 240.0) < 40)
-                    if hid_g[r, i] != 0 or hid_air[r, i] != 0:
-                        x = hid_g[r, i] * (ts - now_hid[i])
-                        d[i] = (x - hid_air[r, i] * (now_hid[i] - room)) / hid_c[r, i]
-                        w -= x
-                    watts[i] += w
-                    net[i] += w
-                for l in range(nl):
-                    if ends[l, 0] == r:
-                        x = link_g[l] * (seen[ends[l, 1]] - seen[ends[l, 2]])
-                        watts[ends[l, 1]] -= x
-                        net[ends[l, 1]] -= x
-                        watts[ends[l, 2]] += x
-                        net[ends[l, 2]] += x
-                # Joule heat in the volumes
-                for j in range(nj):
-                    body = heated[j]
-                    w = column[j, k] * heat_scale[r, j]
-                    if copper[r, j] != 0:
-                        w *= 1 + copper[r, j] * (seen[nb + body] - 20)
-                    heat[body] += w
-                    x = 0.0
+                        now_z, now_hid, f, d, room = z1, hid + nb, f1, hid_rate + nb, air[k + 1]
+                        now = t[k + 1] - t[0] - 1e-9
+                    for i in range(2 * nb):
+                        if need[r, i] or (s == 0 and i >= nb):
+                            x = 0.0
+                            for j in range(n):
+                                x += now_z[j] * push[i, j]
+                            seen[i] = x
+                    if s == 0:
+                        for i in range(nb):
+                            out[r, k, i] = seen[nb + i]
+                        if k == samples - 1:
+                            break
+                    # flows between surfaces
                     for i in range(nb):
-                        share = split[r, j, i] * w
-                        heat[i] += share
-                        x += share
-                    heat[body] -= x
-                for i in range(nb):
-                    watts[nb + i] = heat[i]
-                    if c_varies and (c[r, i] != c0[i] or cap[r, i] != 0 or melt[r, i] != 0):
-                        storage = c[r, i] * fmax(1 + cap[r, i] * (seen[nb + i] - 20), 0.1)
-                        if melt[r, i] != 0:
-                            x = seen[nb + i] - melt_at
-                            storage *= 1 + melt[r, i] * exp(-0.5 * x * x)
-                        watts[nb + i] += (c0[i] / storage - 1) * (net[i] + heat[i])
-                memset(f, 0, n * sizeof(double))
-                for i in range(2 * nb):
-                    w = watts[i]
-                    if w != 0:
+                        watts[i] = net[i] = heat[i] = 0.0
+                    for e in range(ne):
+                        if plain[r, e] and not c_varies:  # nothing beside its part of the modes
+                            if b[e] == nb:
+                                watts[a[e]] += g0[e] * room
+                            continue
+                        ts = seen[a[e]]
+                        other = seen[b[e]] if b[e] < nb else room
+                        cond = g[r, e]
+                        if g_varies:
+                            if temp[r, e] != 0:
+                                cond *= fmax(1 + temp[r, e] * (ts - 20), 0.05)
+                            if step[r, e] != 0:
+                                cond *= 1 + step[r, e] * (now >= t0[r, 0])
+                            if forced[r, e] != 0:
+                                cond *= 1 + forced[r, e] * sqrt(fabs(speed[k]))
+                            if pos[r, e] != 0:
+                                cond *= 1 + pos[r, e] * place[k]
+                            if fan[r, e] != 0:
+                                x = ts - air[k]
+                                fan_on[e] = 1.0 if x > 8 else 0.0 if x < 5 else fan_on[e]
+                                cond *= 1 + fan[r, e] * fan_on[e]
+                        flux = cond * (ts - other)
+                        if b[e] < nb:
+                            linear = (cond - g0[e]) * (ts - other)
+                            net[b[e]] += flux
+                            watts[b[e]] += linear
+                        else:
+                            linear = (cond - g0[e]) * ts - cond * other
+                        net[a[e]] -= flux
+                        watts[a[e]] -= linear
+                    # foreign heat at the surfaces; `net` collects all that comes in
+                    for i in range(nb):
+                        if not foreign[r, i]:
+                            continue
+                        ts = seen[i]
+                        rise = ts - room
+                        w = 0.0
+                        if rad[r, i] != 0:
+                            x, share = (ts + 273.15) * (ts + 273.15), (room + 273.15) * (room + 273.15)
+                            w -= rad[r, i] * (x * x - share * share)
+                        if nat[r, i] != 0:
+                            w -= nat[r, i] * rise * sqrt(sqrt(fabs(rise)))
+                        if q[r, i] != 0:
+                            w += q[r, i] * (now >= t0[r, 0] and now < t1[r, 0])
+                        if eddy[r, i] != 0:
+                            w += eddy[r, i] * speed[k] * speed[k]
+                        if hyst[r, i] != 0:
+                            w += hyst[r, i] * fabs(speed[k])
+                        if based[r, i] != 0:
+                            w -= based[r, i] * (ts - base[k])
+                        if burst[r, i] != 0:
+                            w -= burst[r, i] * fmax(rise - 4, 0.0) * (fmod(now, 240.0) < 40)
+                        if hid_g[r, i] != 0 or hid_air[r, i] != 0:
+                            x = hid_g[r, i] * (ts - now_hid[i])
+                            d[i] = (x - hid_air[r, i] * (now_hid[i] - room)) / hid_c[r, i]
+                            w -= x
+                        watts[i] += w
+                        net[i] += w
+                    for l in range(nl):
+                        if ends[l, 0] == r:
+                            x = link_g[l] * (seen[ends[l, 1]] - seen[ends[l, 2]])
+                            watts[ends[l, 1]] -= x
+                            net[ends[l, 1]] -= x
+                            watts[ends[l, 2]] += x
+                            net[ends[l, 2]] += x
+                    # Joule heat in the volumes
+                    for j in range(nj):
+                        body = heated[j]
+                        w = column[j, k] * heat_scale[r, j]
+                        if copper[r, j] != 0:
+                            w *= 1 + copper[r, j] * (seen[nb + body] - 20)
+                        heat[body] += w
+                        x = 0.0
+                        for i in range(nb):
+                            share = split[r, j, i] * w
+                            heat[i] += share
+                            x += share
+                        heat[body] -= x
+                    for i in range(nb):
+                        watts[nb + i] = heat[i]
+                        if c_varies and (c[r, i] != c0[i] or cap[r, i] != 0 or melt[r, i] != 0):
+                            storage = c[r, i] * fmax(1 + cap[r, i] * (seen[nb + i] - 20), 0.1)
+                            if melt[r, i] != 0:
+                                x = seen[nb + i] - melt_at
+                                storage *= 1 + melt[r, i] * exp(-0.5 * x * x)
+                            watts[nb + i] += (c0[i] / storage - 1) * (net[i] + heat[i])
+                    memset(f, 0, n * sizeof(double))
+                    for i in range(2 * nb):
+                        w = watts[i]
+                        if w != 0:
+                            for j in range(n):
+                                f[j] += w * push[i, j]
+                    if s == 0:
+                        h = t[k + 1] - t[k]
                         for j in range(n):
-                            f[j] += w * push[i, j]
-                if s == 0:
-                    h = t[k + 1] - t[k]
-                    for j in range(n):
-                        z1[j] = z[j] * decay[k, j] + phi1[k, j] * f0[j]
-                    for i in range(nb):
-                        hid[nb + i] = hid[i] + h * hid_rate[i]
-                else:
-                    for j in range(n):
-                        z[j] = z1[j] + phi2[k, j] * (f1[j] - f0[j])
-                    for i in range(nb):
-                        hid[i] += h / 2 * (hid_rate[i] + hid_rate[nb + i])
+                            z1[j] = z[j] * decay[k, j] + phi1[k, j] * f0[j]
+                        for i in range(nb):
+                            hid[nb + i] = hid[i] + h * hid_rate[i]
+                    else:
+                        for j in range(n):
+                            z[j] = z1[j] + phi2[k, j] * (f1[j] - f0[j])
+                        for i in range(nb):
+                            hid[i] += h / 2 * (hid_rate[i] + hid_rate[nb + i])
 
 
 def _track(run, name):

@@ -40,6 +40,12 @@ class Scene:
     outputs_of: Callable[[int, list[Variant]], np.ndarray]  # (run, rows) -> (m, N, ny) readings without noise
     suspects: list[Suspect] = field(default_factory=list)
     unknowns: list[Suspect] = field(default_factory=list)
+    rough_of: Callable[[int, list[Variant]], np.ndarray] | None = None  # outputs_of with fewer volumes
+
+    def changes_of(self, k: int, rows: list[Variant], rough: bool) -> np.ndarray:
+        """Changes (m - 1, N, ny) of the readings from those of the first of `rows`; rough: of fewer volumes, where that saves time."""
+        y = (rough and self.rough_of or self.outputs_of)(k, rows)
+        return y[1:] - y[:1]
 
 
 class Family(Protocol):

@@ -45,7 +45,21 @@ class Network:
 
 def simulate(net: Network, theta: dict, run: dict, rows: list[Variant]) -> np.ndarray:
     """Mean temperatures (m, N, bodies), degC, of every variant; `run`: t (s), air, heats (W), velocity, position."""
-    return march(_modes(net, theta, run), Rows(net, theta, rows, run), run)
+    heat = [_thermal(net, row) for row in rows]
+    apart = [r for r, row in enumerate(heat) if row not in heat[:r]]  # a faulty sensor changes no temperature
+    modes = _modes(net, theta | rows[0].theta, run)  # the others differ little from the first
+    found = march(modes, Rows(net, theta, [heat[r] for r in apart], run), run)
+    return found[[next(i for i, r in enumerate(apart) if heat[r] == row) for row in heat]]
+
+
+def _thermal(net: Network, row: Variant) -> Variant:
+    """The part of a variant that the temperatures depend on."""
+    own = {*net.bodies.values(), *(g for g, _, _ in net.edges.values())}
+    return Variant(
+        {p: v for p, v in row.theta.items() if p in own or p.startswith("scale:")},
+        row.start,
+        [e for e in row.effects if e[0] not in sensors.SENSOR_FAULTS and e[0] not in OUTPUT_EFFECTS],
+    )
 
 
 def march_compiled(modes: Modes, v: Rows, run: dict) -> np.ndarray:
@@ -66,6 +80,7 @@ def march_in_python(modes: Modes, v: Rows, run: dict) -> np.ndarray:
     z, hidden = modes.start(v, run), modes.hidden_start(v, run)
     out = np.empty((m, len(t), nb))
     heat_total = [np.asarray(run[name], float) for name in v.heat_columns]
+    c_varies = v.present & {"cap", "melt"} or np.any(v.c != modes.c0)
 
     def force(
         z: np.ndarray, hidden: np.ndarray, k: int, air_now: float, now: float
@@ -82,7 +97,7 @@ def march_in_python(modes: Modes, v: Rows, run: dict) -> np.ndarray:
         extra, heat, hidden_rate = v.extra(ts, tm, hidden, k, air_now, now, heat_total)
         surface_w = surface_w + extra
         volume_w = heat
-        if v.c_varies:
+        if c_varies:
             volume_w = volume_w + (modes.c0 / v.capacity(tm) - 1) * (net_w + extra + heat)
         return np.concatenate([surface_w, volume_w], axis=1) @ modes.push, hidden_rate
 
@@ -253,8 +268,6 @@ class Rows:
         self.present = {k for k, x in (body | edge).items() if np.any(x)}
         self.g_varies = bool(self.present & set(edge))
         self.fan_on = np.zeros((m, ne))
-        c_truth = np.array([theta[c] for c in net.bodies.values()])
-        self.c_varies = bool(self.present & {"cap", "melt"} or np.any(self.c != c_truth))
         self.heat_columns = [f"heat:{q}" for q in heats]
         self.heat_body = np.array([at[net.joule[q][0]] for q in heats])
         self.heat_scale = np.array([[p.get(f"scale:{q}", 1.0) for q in heats] for p in full], float)

@@ -91,14 +91,21 @@ def write(rows: Mapping[str, Row], *files: Path) -> dict[str, Any]:
     return new
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command: 1 when a diagnosis failed."""
-    p = argparse.ArgumentParser(prog="python -m tests.truth", description=__doc__.splitlines()[0])
+def options(p: argparse.ArgumentParser) -> None:
+    """Add the options that choose the cases."""
     p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
     p.add_argument("--seed", type=int, help="other generated cases: those of this seed, in both worlds")
     p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
     p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
-    p.add_argument("--out", type=Path, default=Path("build/truth"))
+    p.add_argument(
+        "--out", type=Path, default=Path("build/truth"), help="folder of the cases and their diagnoses"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command: 1 when a diagnosis failed."""
+    p = argparse.ArgumentParser(prog="python -m tests.truth", description=__doc__.splitlines()[0])
+    options(p)
     p.add_argument(
         "--old", type=Path, default=BASE_LINE, help="the older result (default: the committed base line)"
     )

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.truth.__main__ import GROUPS, cases, write
+from tests.truth.__main__ import GROUPS, cases, options, write
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import KEPT, kept, sought
 from thermoctl.diagnosis import diagnose as engine
@@ -206,10 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command."""
     p = argparse.ArgumentParser(prog="python -m tests.truth.ablate", description=__doc__.splitlines()[0])
     p.add_argument("rules", nargs="*", metavar="RULE", help="default: all of the decision")
-    p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
-    p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
-    p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
-    p.add_argument("--out", type=Path, default=Path("build/truth"), help="folder of make truth")
+    options(p)
     p.add_argument(
         "--search", action="store_true", help="the rules of the search: each case is searched again"
     )

@@ -11,7 +11,7 @@ import yaml
 from tests.proof.recordings import VARIABLE
 from tests.truth import __main__ as truth
 from tests.truth import cases as made
-from tests.truth import judge, run
+from tests.truth import ablate, judge, run
 from tests.truth.ablate import RULES, left_out, part_of
 from thermoctl.diagnosis.limits import limits
 
@@ -135,3 +135,9 @@ def test_a_rule_names_a_part_of_the_program_and_comes_back(name):
         inside = [part_of(path) for path in rule.without]
     assert inside == [*rule.without.values()]
     assert all(part_of(path) != other for path, other in rule.without.items())
+
+
+def test_rules_can_be_left_out_by_a_command_of_the_same_words_as_make_truth(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv(made.FOREIGN, raising=False)
+    assert ablate.main(["--only", "foreign", "--number", "2", "--out", str(tmp_path)]) == 2
+    assert "run make truth first" in capsys.readouterr().err
