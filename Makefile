@@ -42,7 +42,7 @@ PROOF ?= build/proof
 SEED ?= 7
 NUMBER ?= 600
 prove: develop                     # the full proof on concealed cases: made, sealed, diagnosed, scored; hours; run again to continue
-	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED)
+	$(BIN)/python -m tests.concealed.generate --out $(PROOF)/cases --answers $(PROOF)/answers --number $(NUMBER) --seed $(SEED) --world both
 	$(BIN)/python -m tests.proof $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
 .PHONY: truth

@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -559,6 +561,26 @@ def listing(slots: Sequence[Slot], answers: Sequence[dict]) -> str:
     return "\n".join(lines)
 
 
+def _write_one(a: argparse.Namespace, answers: Path | None, number: int) -> str:
+    """Make case `number` of the set that the arguments name, unless it is there; return a line about it."""
+    name = f"{number + 1:04d}"
+    target = a.out / name / "answer.yaml" if answers is None else answers / f"{name}.yaml"
+    if target.exists():
+        return ""
+    world = ("closed", "open")[number % 2] if a.world == "both" else a.world
+    try:
+        plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke, a.kind, world)
+    except NotVisible as e:
+        return f"{e}; the set has a gap there"
+    write_case(a.out / name, plant, tables)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(yaml.safe_dump(_plain(answer), sort_keys=False))
+    return (
+        f"{name} {answer['family']:9s} {answer['schedule']:15s} {answer['kind']:7s} {answer['band'] or '':6s} "
+        f"{answer['snr']} {answer['effects']} ~ {answer['nearly_the_same']}"
+    )
+
+
 def main(argv: list[str] | None = None) -> int:
     """The command."""
     p = argparse.ArgumentParser(prog="tests.concealed.generate", description=__doc__)
@@ -570,6 +592,7 @@ def main(argv: list[str] | None = None) -> int:
     p.add_argument("--first", type=int, default=0, help="number of the first case (to make a part of a set)")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--smoke", action="store_true", help="short records")
+    p.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     p.add_argument("--answers", default=None, help="folder for the sealed answers, or 'inside'")
     p.add_argument("--families", default=",".join(FAMILIES))
     p.add_argument(
@@ -588,26 +611,12 @@ def main(argv: list[str] | None = None) -> int:
         print(listing(slots, [yaml.safe_load(f.read_text()) for f in files]))
         return 0
     a.out.mkdir(parents=True, exist_ok=True)
-    for number in range(a.first, a.first + a.number):
-        name = f"{number + 1:04d}"
-        target = a.out / name / "answer.yaml" if inside else answers / f"{name}.yaml"
-        if target.exists():
-            continue
-        try:
-            world = ("closed", "open")[number % 2] if a.world == "both" else a.world
-            plant, tables, answer = make_case(a.seed, number, a.families.split(","), a.smoke, a.kind, world)
-        except NotVisible as e:
-            print(f"{e}; the set has a gap there", file=sys.stderr, flush=True)
-            continue
-        write_case(a.out / name, plant, tables)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(yaml.safe_dump(_plain(answer), sort_keys=False))
-        print(
-            f"{name} {answer['family']:9s} {answer['schedule']:15s} {answer['kind']:7s} {answer['band'] or '':6s} "
-            f"{answer['snr']} {answer['effects']} ~ {answer['nearly_the_same']}",
-            file=sys.stderr,
-            flush=True,
-        )
+    numbers = range(a.first, a.first + a.number)
+    one = partial(_write_one, a, None if inside else answers)
+    apart = map if a.number == 1 else ProcessPoolExecutor(min(a.workers, a.number)).map
+    for line in apart(one, numbers):
+        if line:
+            print(line, file=sys.stderr, flush=True)
     if not inside:
         files = sorted(answers.glob("[0-9]*.yaml"))
         (answers / "manifest.sha256").write_text(

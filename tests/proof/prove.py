@@ -12,17 +12,17 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.proof.cases import find_jobs, read_answers
 from tests.proof.score import Row, plain, score
 from tests.proof.summary import summary
+from tests.truth.run import diagnose
 from thermoctl import __version__
 from thermoctl.files.safe_file import whole_files, write_text
 from thermoctl.files.yamlfile import InputError
-from thermoctl.fleet.batch import OnCase, run_all, run_one
+from thermoctl.fleet.batch import OnCase, run_all
 from thermoctl.fleet.jobs import Job, outcome
 from thermoctl.recording.files import read_table
 
@@ -41,7 +41,7 @@ def prove(
     OUT/summary.json is the same without the cases, to be kept with a commit."""
     out = Path(out_dir)
     jobs = find_jobs(cases, number)
-    run_all(jobs, out / "cases", scheduler, workers, partial(run_one, report=False), progress)
+    run_all(jobs, out / "cases", scheduler, workers, diagnose, progress)
     sealed = read_answers(jobs, Path(answers) if answers is not None else None)
     rows = [_scored(job, out / "cases", sealed[job.name]) for job in jobs]
     figures = {
@@ -63,7 +63,7 @@ def prove(
 def _scored(job: Job, cases: Path, answer: Mapping[str, Any]) -> Row:
     result, run = outcome(job, cases)
     duration_s = _duration(job.recordings) if answer.get("onset") is not None else None
-    return score(job.name, answer, result, run.get("seconds"), run["error"], duration_s)
+    return score(job.name, answer, result, run.get("cpu_s"), run["error"], duration_s)
 
 
 def _duration(recordings: Sequence[str]) -> float | None:

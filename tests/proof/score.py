@@ -54,7 +54,7 @@ class Row:
     confident: bool
     onset_error: float | None  # share of the recording's length
     gain: float | None
-    seconds: float | None
+    cpu_s: float | None
     error: str | None
     world: str = "closed"  # open: with small misfits of no known name
     strays: int = 0  # findings that are neither a true effect nor an equivalent one
@@ -133,7 +133,7 @@ def score(
     case: str,
     answer: Mapping[str, Any],
     result: Mapping[str, Any] | None,
-    seconds: float | None = None,
+    cpu_s: float | None = None,
     error: str | None = None,
     duration_s: float | None = None,
 ) -> Row:
@@ -171,7 +171,7 @@ def score(
         confident=any(float(f["probability"]) >= CONFIDENT for f in result["findings"]),
         onset_error=_onset(answer.get("onset"), result["findings"], duration_s),
         gain=_gain(result.get("fit", {}), answer.get("oracle_rms")),
-        seconds=seconds,
+        cpu_s=cpu_s,
         error=error,
         world=str(answer.get("world", "closed")),
         strays=len(findings) - len(right_by_name),

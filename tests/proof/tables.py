@@ -44,8 +44,8 @@ _NUMBERS = {
     "gain_worst_tenth": "held-out gain, worst tenth",
     "parameter_error_median": "effect parameter error, median",
     "set_size_when_ambiguous": "names in an ambiguous set",
-    "seconds_median": "seconds a case, median",
-    "seconds_longest": "seconds a case, longest",
+    "cpu_s_median": "CPU s a case, median",
+    "cpu_s_longest": "CPU s a case, longest",
 }
 
 

@@ -217,8 +217,8 @@ def test_summary_of_a_hand_made_set():
     assert s["figures"]["detected_middle"] is None and s["goals"]["detected_middle"]["reached"] is None
     assert s["shares"]["right_when_named"]["k"] == 1 and s["shares"]["right_when_named"]["n"] == 4
     assert s["figures"]["unknown_called_unknown"] == 0.5 and s["figures"]["confidently_misnamed"] == 0.5
-    assert s["figures"]["inside_the_set"] == 0.5 and s["figures"]["seconds_longest"] == 70.0
-    assert s["goals"]["seconds_longest"]["reached"] is True and s["goals"]["false_alarms"]["reached"] is False
+    assert s["figures"]["inside_the_set"] == 0.5 and s["figures"]["cpu_s_longest"] == 70.0
+    assert s["goals"]["cpu_s_longest"]["reached"] is True and s["goals"]["false_alarms"]["reached"] is False
     assert s["confusion"]["radiation"] == {"radiation": 1, "none": 1} and s["confusion"]["unknown"] == {
         "unknown": 1,
         "radiation": 1,
@@ -277,7 +277,7 @@ def fake(job, out: str) -> dict:
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder.parent / "log", "a") as f:
         f.write(job.name + "\n")
-    told = {"name": job.name, "fingerprint": job.fingerprint(), "seconds": 1.0, "error": None}
+    told = {"name": job.name, "fingerprint": job.fingerprint(), "cpu_s": 1.0, "error": None}
     (folder / "diagnosis.json").write_text(json.dumps(result("consistent")))
     (folder / "run.json").write_text(json.dumps(told))
     return told

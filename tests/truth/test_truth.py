@@ -10,8 +10,8 @@ import yaml
 
 from tests.proof.recordings import VARIABLE
 from tests.truth import __main__ as truth
-from tests.truth import cases as made
 from tests.truth import ablate, judge, run
+from tests.truth import cases as made
 from tests.truth.ablate import RULES, left_out, part_of
 from thermoctl.diagnosis.limits import limits
 
