@@ -5,9 +5,6 @@
    esdirk.h takes those where its error does not pass or the plant is stiff. Sensitivities S = dx/dq are the exact derivative
    of the step that was taken; of ESDIRK's
        (I - h g J_i) S_i = S_base,i + h g F_p,i          (staggered direct method)                                      */
-#if NX > 2 /* slopes take a sixth less time, and most of a refit; a run of two states would take longer */
-#pragma GCC optimize("O2", "no-tree-vectorize")
-#endif
 #include "compiled.h"
 #include "esdirk.h"
 
