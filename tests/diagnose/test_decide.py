@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from thermoctl.diagnosis.limits import limits
@@ -74,6 +75,11 @@ def test_a_likely_effect_that_may_be_a_misfit_is_no_certainty():
     assert found.something == pytest.approx(0.7)
 
 
+def test_evidence_that_nothing_else_confirms_is_worth_the_root_of_its_odds():
+    p = weigh({NOTHING: 0.0, ONE: 3.0}, {NOTHING: {}, ONE: {A: 1.0}}, limits().unasked).effects[A]
+    assert p / (1 - p) == pytest.approx(np.exp(3.0) ** 0.5)
+
+
 def one(square: float, misfit: float) -> Energy:
     """Energies of a single output with so many rows that noise moves nothing."""
     return Energy((square,), (misfit,), (1e15,))
@@ -118,7 +124,6 @@ def test_without_a_misfit_every_effect_stands():
 
 
 def test_the_odds_of_physics_are_a_log_uniform_size_against_a_normal_one():
-    import numpy as np
     from scipy.stats import loguniform, norm
 
     r = 3.0  # sizes in standard deviations of the misfit, over four decades about it

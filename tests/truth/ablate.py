@@ -13,13 +13,14 @@ import argparse
 import dataclasses
 import importlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.truth import dozen
 from tests.truth.__main__ import GROUPS, cases, options, write
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import KEPT, kept, sought
@@ -37,11 +38,13 @@ class Rule:
 
     - `without`: name of the program (below thermoctl.diagnosis) to what takes its place
     - `limits`: numbers of config/diagnosis.yaml in place of theirs
+    - `weighed`: changes the evidence of what the search found
     - `searches`: it acts in the search, else in the decision"""
 
     says: str
     without: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Any] = field(default_factory=dict)
+    weighed: Callable[[engine.Sought], engine.Sought] = lambda found: found
     searches: bool = False
 
 
@@ -90,6 +93,11 @@ RULES: Mapping[str, Rule] = {
         "an effect counts only where it stands out of the misfit that stays",
         {"verdict.misfit.physics": _sure},
     ),
+    "dozen": Rule(
+        "an effect counts only where it stands out; in its place, a misfit's rows count as a few draws (dozen.py)",
+        {"verdict.misfit.physics": _sure},
+        weighed=dozen.weighed,
+    ),
     "simpler": Rule(
         "an entry that contains a simpler one has to stand out against it",
         {"verdict.misfit._is_simpler": _no},
@@ -115,6 +123,9 @@ RULES: Mapping[str, Rule] = {
     ),
     "only noise": Rule(
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
+    ),
+    "unasked": Rule(
+        "where nothing is asked of other parts, the log evidence counts half", limits={"unasked": 1.0}
     ),
     "floor": Rule("an error far below the noise is luck", {"verdict.confirm.FLOOR": 1e-6}),
     "draws": Rule("a smooth error counts as few draws", {"verdict.confirm._draws": _all}),
@@ -186,7 +197,8 @@ def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, s
     with one_thread(), left_out(rule):
         try:
             found = sought(job, numbers) if rule.searches else kept(folder / job.name)
-            return contract(engine.decided(dataclasses.replace(found, limits=numbers))), None
+            changed = dataclasses.replace(rule.weighed(found), limits=numbers)
+            return contract(engine.decided(changed)), None
         except Exception as e:  # a crash is a result
             return None, f"{type(e).__name__}: {e}"
 

@@ -102,7 +102,8 @@ def _decided(sought: Sought) -> Diagnosis:
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     fits = {keys: w.fitted for keys, w in tried.items()}
-    posterior = weigh({keys: tried[keys].score for keys in physics}, physics)
+    scores = {keys: tried[keys].score for keys in physics}
+    posterior = weigh(scores, physics)
     best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
     asked: dict[Key, float] = {}
     if posterior.something >= numbers.name:
@@ -113,6 +114,9 @@ def _decided(sought: Sought) -> Diagnosis:
         # beside known physics whose residual is only noise, there is no misfit that it could imitate
         if reserve or any(key[0] == LAW for key in chosen) or not only_noise(known, fits[chosen], numbers):
             kept, posterior, asked = confirmed(posterior, chosen, Confirm(known, fits, reserve), numbers.name)
+        else:  # but evidence that nothing else confirms counts less
+            posterior = weigh(scores, physics, numbers.unasked)
+            kept = chosen if posterior.something >= numbers.name else frozenset()
         best = with_residuals(known, fits[kept]) if kept else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)

@@ -22,6 +22,7 @@ class Thresholds:
     set: float
     clean: float
     alike: float
+    unasked: float
 
 
 def limits() -> Thresholds:

@@ -60,12 +60,15 @@ class Decision:
 
 
 def weigh(
-    scores: Mapping[frozenset[Key], float], physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    scores: Mapping[frozenset[Key], float],
+    physics: Mapping[frozenset[Key], Mapping[Key, float]],
+    divisor: float = 1.0,
 ) -> Probabilities:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 
-    `scores`: log evidence plus log prior odds. `physics`: probability that each effect of a hypothesis is
-    physics and no unnamed misfit."""
+    `scores`: log evidence plus log prior odds, divided by `divisor`. `physics`: probability that each effect
+    of a hypothesis is physics and no unnamed misfit."""
+    scores = {keys: score / divisor for keys, score in scores.items()}
     total = logsumexp(np.array([*scores.values()]))
     of = {keys: float(np.exp(score - total)) for keys, score in scores.items()}
     order = sorted(of, key=lambda keys: (-of[keys], -scores[keys], sorted(keys)))
