@@ -10,7 +10,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
@@ -334,7 +333,7 @@ def _without_outliers(
             index = np.flatnonzero(np.isfinite(e[:, j]))
             if len(index) < LEAST:
                 continue
-            away = e[index, j] - median_filter(e[index, j], 5)
+            away = e[index, j] - _median_of_five(e[index, j])
             limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
             odd = index[(np.abs(away) > limit) & ~predicted]
@@ -344,6 +343,13 @@ def _without_outliers(
                 dropped.append((t.name, o.column, tuple(float(at) for at in t.t[odd] - t.t[0])))
         out.append(dataclasses.replace(t, columns=columns))
     return out, tuple(dropped)
+
+
+def _median_of_five(e: np.ndarray) -> np.ndarray:
+    """Return the median of each value and its two neighbours on either side; ends are mirrored."""
+    # scipy.ndimage has it, and takes a tenth of a diagnosis' time until work starts
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(e, 2, mode="symmetric"), 5)
+    return np.asarray(np.sort(around, axis=1)[:, 2])
 
 
 def outlier_note(outliers: Outliers) -> str:
