@@ -152,11 +152,13 @@ def _refitted(
     parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
+        led, there = _led(posterior, parent.rough.cost if parent else np.inf)
         start = refit.fit(
             posterior.model,
             posterior.drives,
             case.noise,
-            start=_led(posterior, parent.rough.cost if parent else np.inf),
+            start=led,
+            there=there,
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
@@ -195,37 +197,42 @@ def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
     return z
 
 
-def _led(posterior: Posterior, parent: float) -> np.ndarray:
-    """Return the unknowns from which a refit starts: the effects at full size, if these improve the fit.
+def _led(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evaluation | None]:
+    """Return the unknowns from which a refit starts, and their evaluation; None if it failed.
 
-    The plant's own parameters may have imitated the effect. Then at full size the cost is above `parent`, the
-    cost of the refit without the effect. In that case one Gauss-Newton step is taken from a small share of
-    the effect. Sizes and the plant's parameters change in this step, shapes do not. The refit starts at full
-    size, at the small share or after the step, whichever has the least cost."""
+    They are the effects at full size, if these improve the fit. The plant's own parameters may have imitated
+    the effect. Then at full size the cost is above `parent`, the cost of the refit without the effect. In
+    that case one Gauss-Newton step is taken from a small share of the effect. Sizes and the plant's
+    parameters change in this step, shapes do not. The refit starts at full size, at the small share or after
+    the step, whichever has the least cost."""
     problem = posterior.problem
     full = problem.start({})
-    costs = [_cost(problem, full)]
+    starts = [(full, _evaluated(problem, full))]
     plant = posterior.plant.parameters
     names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.sizes.items() if p.amplitude}
-    if costs[0] < parent or not names:
-        return full
+    if _cost(starts[0]) < parent or not names:
+        return starts[0]
     small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
     own = {n for e in posterior.effects for n in e.own.values()}
     free = np.array([k for k, (q, _) in enumerate(problem.unknowns) if q not in own or q in names])
     try:
-        led = _along_values(posterior, small, problem.evaluate(small, True), free)
+        now = problem.evaluate(small, True)
+        led = _along_values(posterior, small, now, free)
     except SimulationError:
-        return full
-    starts = [full, small, led]
-    costs += [_cost(problem, small), _cost(problem, led)]
-    return starts[int(np.argmin(costs))]
+        return starts[0]
+    starts += [(small, now), (led, _evaluated(problem, led))]
+    return min(starts, key=_cost)
 
 
-def _cost(problem: Problem, z: np.ndarray) -> float:
+def _evaluated(problem: Problem, z: np.ndarray) -> Evaluation | None:
     try:
-        return problem.evaluate(z, False).cost
+        return problem.evaluate(z, False)
     except SimulationError:
-        return float("inf")
+        return None
+
+
+def _cost(start: tuple[np.ndarray, Evaluation | None]) -> float:
+    return start[1].cost if start[1] else float("inf")
 
 
 def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np.ndarray) -> np.ndarray:

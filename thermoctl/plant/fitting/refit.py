@@ -100,11 +100,13 @@ def fit(
     goal: float = np.inf,
     priors: Sequence[Prior] = (),
     progress: Callable[[str], None] | None = None,
+    there: Evaluation | None = None,
 ) -> Fit:
     """Fit the active parameters that have a range, and the uncertain initial states, to the recordings.
 
-    `tries`: random starts over the ranges besides `start`; the best KEPT_STARTS are followed. `seconds`: no
-    iteration begins after so much CPU time of this thread. `goal`: stop where this cost is out of reach.
+    `there`: the evaluation at `start`, where it is known. `tries`: random starts over the ranges besides
+    `start`; the best KEPT_STARTS are followed. `seconds`: no iteration begins after so much CPU time of this
+    thread. `goal`: stop where this cost is out of reach.
     Raises SimulationError if no start can be simulated, InputError if there is nothing to compare."""
     for d in excitations:
         if d.scale is None:
@@ -116,7 +118,7 @@ def fit(
     failure: SimulationError | None = None
     for z in [z0, *_random_starts(problem, z0, tries, seed)]:
         try:
-            followed = _follow(problem, z, limits, best)
+            followed = _follow(problem, z, limits, best, there if z is z0 else None)
         except SimulationError as e:
             failure = failure or e
             continue
@@ -145,9 +147,11 @@ def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> l
     return [z for _, z in sorted(tried, key=lambda item: item[0])[:KEPT_STARTS]]
 
 
-def _follow(problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None) -> Fit | None:
+def _follow(
+    problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None, there: Evaluation | None
+) -> Fit | None:
     """Descend from a start, updating the outlier limits; None if it does not soon come below `best`."""
-    problem.set_outlier_limits(problem.evaluate(z, False).residuals)
+    problem.set_outlier_limits((there or problem.evaluate(z, False)).residuals)
     if best is not None:
         z = _descend(problem, z, dataclasses.replace(limits, iterations=PREVIEW)).z
         squares = _sum_of_squares(problem, problem.evaluate(z, False).residuals)
