@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.laws.prove import EQUAL, difference
+from tests.laws.prove import EQUAL, cases, difference
 from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
 from tests.plants import TWO_BLOCKS
@@ -18,7 +18,8 @@ from tests.proof.rigs import RIGS
 from thermoctl.cli import main
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
-from thermoctl.diagnosis.evidence.fit import fitted
+from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.experiment.propose import propose, survivors
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
@@ -100,6 +101,17 @@ def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
     assert main(["effects", "check", str(own), "--plant", str(tmp_path / "plant.yaml")]) == 0
     assert main(["effects", "save", str(tmp_path), "peltier", "--effects", str(own)]) != 0
     assert "exists already" in capsys.readouterr().err
+
+
+def test_a_law_keeps_its_prior_odds_beside_effects(found):
+    """It had the odds of an entry of the catalogue there, so that any effect beside a law gained some ten nats."""
+    _, d, law = found
+    known, leader = d.case, d.searched.tried[0]
+    rig = Structure(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    other = Placed(candidates(rig, catalogue())[0], {})
+    places = {other.key[0]: {other.key[1]}}
+    alone, beside = (odds((*effects, other), places, limits()) for effects in ((), (law.placed,)))
+    assert beside - alone == pytest.approx(leader.log_odds) == pytest.approx(-law.proposal.cost)
 
 
 def test_a_larger_plant_gets_fewer_refits_of_laws(found):
@@ -281,9 +293,34 @@ def test_a_law_that_recordings_set_aside_do_not_confirm_is_no_finding():
 
 @pytest.mark.slow  # twenty seconds
 def test_the_pendulums_law_has_its_published_form():
+    """Dry friction is sure. That the rest is a power and no tanh is not.
+
+    Their evidences differ by 0.2 nats, and on run_2, set aside, they close 66 % both."""
     if not FOLDER.is_dir():
         pytest.skip(f"{FOLDER}: no such folder; set THERMOCTL_RECORDINGS to the folder of the recordings")
     d = law_of(FOLDER, next(r for r in RIGS if r.name == "pendulum"))
-    forms = {t.form.name: f"n{k}" for k, t in enumerate(d.law.proposal.terms, 1)}
-    assert forms.keys() in ({"friction", "power"}, {"tanh", "power"})
-    assert 1.8 < law_entry(d.law, d.worth)["parameters"][forms["power"]]["value"] < 2.2
+    laws = [(d.law.proposal, d.law.fitted, d.law.share), *d.law.rivals]
+    found = {tuple(sorted(t.form.name for t in p.terms)): (p, f, share) for p, f, share in laws}
+    assert all("friction" in forms for forms in found)
+    p, f, share = found["friction", "power"]
+    number = 1 + [t.form.name for t in p.terms].index("power")
+    assert share > 0.3 and d.worth.share_closed > 0.6
+    assert 1.8 < f.plant.parameters[placed_law(f).own[f"n{number}"]].value < 2.2
+
+
+@pytest.mark.slow  # a minute: the whole diagnosis
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tanks: log(1 + 3 * x**2) of upper | middle | open",
+        "tanks: siphon | large | closed",
+        "heater: fan with hysteresis | middle | open",
+    ],
+)
+def test_no_name_stands_beside_a_law_or_in_its_place(name):
+    """Two sensor faults stood for the first law, an overflow beside the second, a heat source beside the third."""
+    law, *case_of = next(c[1:] for c in cases() if c[0] == name)
+    made = make(law, *case_of)
+    d = diagnose(made.plant, made.tables[:3], catalogue(), limits())
+    assert not d.shown
+    assert d.law.proposal.place == Place(law.target)

@@ -43,6 +43,11 @@ class Placed:
         """Return (name of the effect, name of its place): the key of the placed effect."""
         return self.candidate.key
 
+    @property
+    def log_odds(self) -> float | None:
+        """Return its log prior odds where it is not of the catalogue (a law), else None."""
+        return None
+
 
 @dataclass(frozen=True)
 class Hypothesis:

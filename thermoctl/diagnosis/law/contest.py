@@ -20,7 +20,7 @@ from thermoctl.diagnosis.law.find import refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.propose import Proposal, propose_laws
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.diagnosis.search.beam import BEATEN, SURPLUS, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -58,41 +58,34 @@ def _laws(
 ) -> list[Weighed]:
     """Return a hypothesis with the best law at each place, beside a parent and beside the plant alone.
 
-    Only laws that may come near the score `ahead` are refitted. Sums of terms follow if one term is ahead.
+    Only laws that may come near the score `ahead` are refitted.
     The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
     them, too. There its promise is larger by what the effects gain."""
     try:
-        proposals, _ = propose_laws(case, parent.fitted, limits.rare)
+        proposals, _ = propose_laws(case, parent.fitted, limits)
     except (SimulationError, np.linalg.LinAlgError):
         return []
     taken = {key[1] for key in parent.fitted.hypothesis.keys if key[0] == LAW}
     proposals = [p for p in proposals if p.place.where not in taken]
-    term = float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
-
-    def cost(p: Proposal) -> float:
-        """Return minus the log prior odds of a law: for each term `missing` and `rare`, and its own cost."""
-        return p.cost - term * len(p.terms)
 
     def refitted(base: Weighed, some: Sequence[Proposal]) -> list[tuple[Proposal, Weighed]]:
         """Return the laws that were refitted beside a hypothesis."""
-        tried = refits(case, base.fitted, some, cost, ahead - BEATEN - base.score, say)
-        return [(p, Weighed(f, base.log_odds - cost(p))) for p, f in tried]
+        tried = refits(case, base.fitted, some, ahead - BEATEN - base.score, say)
+        return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
-    single = [p for p in proposals if len(p.terms) == 1]
-    beside = refitted(parent, single)
-    if max((w.score for _, w in beside), default=-np.inf) >= ahead:
-        beside += refitted(parent, [p for p in proposals if len(p.terms) > 1])
-    groups = [beside]
+    groups = [(parent, refitted(parent, proposals))]
     if parent is not alone:
         more, plant = parent.score - alone.score, alone.fitted.plant
         known = {*plant.nodes, *plant.inputs, *plant.parameters, "t"}
+        single = [p for p in proposals if len(p.terms) == 1]
         stands = [p for p in single if known >= {*p.place.nodes, *_names(p)}]
-        groups.append(refitted(alone, [replace(p, promise=p.promise + more) for p in stands]))
-    return [
-        _best([x for x in some if x[0].place == place], limits)
-        for some in groups
+        groups.append((alone, refitted(alone, [replace(p, promise=p.promise + more) for p in stands])))
+    found = (
+        _best([x for x in some if x[0].place == place], base, limits)
+        for base, some in groups
         for place in {p.place: 0 for p, _ in some}
-    ]
+    )
+    return [w for w in found if w]
 
 
 def _names(p: Proposal) -> set[str]:
@@ -100,8 +93,14 @@ def _names(p: Proposal) -> set[str]:
     return {n for t in p.terms for s in t.signals for n in ex.names(s.value)}
 
 
-def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed:
-    """Return the likeliest law at one place. Its `rivals` are the others that fit about as well."""
+def _best(laws: Sequence[tuple[Proposal, Weighed]], base: Weighed, limits: Thresholds) -> Weighed | None:
+    """Return the likeliest law at one place. Its `rivals` are the others that fit about as well.
+
+    As in the search of the catalogue, one with an insignificant part has to be SURPLUS above all others."""
+    simplest = max([base.score, *(w.score for _, w in laws if not w.fitted.doubtful)])
+    laws = [(p, w) for p, w in laws if not w.fitted.doubtful or w.score > simplest + SURPLUS]
+    if not laws:
+        return None
     share = softmax(np.array([w.score for _, w in laws]))
     order = np.argsort(-share, kind="stable")
     best = laws[order[0]][1]

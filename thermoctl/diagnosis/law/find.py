@@ -79,18 +79,13 @@ def found_law(
 
 
 def refits(
-    case: Case,
-    parent: Fitted,
-    proposals: Sequence[Proposal],
-    cost: Callable[[Proposal], float],
-    least: float,
-    say: Callable[[str], None],
+    case: Case, parent: Fitted, proposals: Sequence[Proposal], least: float, say: Callable[[str], None]
 ) -> list[Tried]:
-    """Refit the proposals that may beat the best law so far, and sums without an insignificant term.
+    """Refit the proposals that may beat the best law so far.
 
-    `cost`: minus the log prior odds of a law; `least`: log posterior odds that a law must reach. A promise is
-    the first-order gain. All promises are multiplied by the largest ratio so far of a refit's gain to its
-    promise."""
+    From the best sum, and from one with an insignificant term, the least significant term is left out.
+    `least`: log posterior odds that a law must reach. A promise is the first-order gain. All promises are
+    multiplied by the largest ratio so far of a refit's gain to its promise."""
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
     gain, ratio, leader, left = max(least, 0.0), 1.0, parent, affordable(case, parent)
@@ -98,7 +93,7 @@ def refits(
     def wanted(p: Proposal) -> bool:
         """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
-        if not left or case.budget.stopped() or cost(p) + gain > HALF * ratio * p.promise:
+        if not left or case.budget.stopped() or p.cost + gain > HALF * ratio * p.promise:
             return False
         left -= 1
         return True
@@ -110,11 +105,12 @@ def refits(
             if f is None:
                 continue
             more_evidence = f.log_evidence - parent.log_evidence
-            gain, ratio = max(gain, more_evidence - cost(p)), max(ratio, more_evidence / max(p.promise, 1.0))
+            gain, ratio = max(gain, more_evidence - p.cost), max(ratio, more_evidence / max(p.promise, 1.0))
             leader = max(leader, f, key=lambda x: x.log_likelihood)
             if not f.absent and not at_bound(f):
                 tried.append((p, f))
-            if len(p.terms) > 1 and more and (f.doubtful or at_bound(f)):
+            best = more_evidence - p.cost >= gain
+            if len(p.terms) > 1 and more and (f.doubtful or at_bound(f) or best):
                 simpler = simpler_law(p, f)
                 if simpler.kind not in {q.kind for q in queue}:
                     queue.append(simpler)

@@ -20,6 +20,7 @@ from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
+from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -51,24 +52,26 @@ class Proposal:
     sizes: tuple[float, ...]
     promise: float
     look: float  # log of the number of places, signals and forms that a term was chosen from
-    rare: float  # prior probability of a term that does not reverse with the signal that drives the flow
+    limits: Thresholds
 
     @property
     def cost(self) -> float:
         """Return minus the log of its prior odds.
 
-        A term is chosen from many places, signals and forms; a second signal adds one more choice. A flow
-        that a difference or a velocity drives usually reverses with it: other terms have the prior
-        `rare`."""
+        Each term has the odds `missing` and `rare`, and is chosen from many places, signals and forms; a
+        second signal adds one more choice. A flow that a difference or a velocity drives usually reverses
+        with it: other terms have the prior `rare`."""
+        missing, rare = self.limits.missing, self.limits.rare
         chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
+        chosen -= len(self.terms) * float(np.log(missing / (1 - missing) * rare))
         return chosen + float(np.log(2)) * self.shapes + sum(self._form_cost(t) for t in self.terms)
 
     def _form_cost(self, t: Term) -> float:
         """Return minus the log of a form's prior over the prior if all forms were equally likely."""
         if t.reverses is None:
             return 0.0
-        odd = sum(form.odd for form in library()) / len(library())
-        return float(np.log(odd / (1 - self.rare)) if t.reverses else np.log((1 - odd) / self.rare))
+        odd, rare = sum(form.odd for form in library()) / len(library()), self.limits.rare
+        return float(np.log(odd / (1 - rare)) if t.reverses else np.log((1 - odd) / rare))
 
     @property
     def kind(self) -> tuple[Place, tuple[tuple[str, tuple[Signal, ...]], ...]]:
@@ -101,10 +104,8 @@ class Found:
         return self.term.form.name, self.term.signals
 
 
-def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal], Tracked]:
-    """Return the most promising laws, best first, and the linearised plant. Raises SimulationError.
-
-    `rare`: prior probability of a term that does not reverse with the signal that drives the flow."""
+def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> tuple[list[Proposal], Tracked]:
+    """Return the most promising laws, best first, and the linearised plant. Raises SimulationError."""
     drives = case.drives(parent.rough.model)
     rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
@@ -123,7 +124,7 @@ def propose_laws(case: Case, parent: Fitted, rare: float) -> tuple[list[Proposal
         pool += _singles(linear, place, first, every)
     pool.sort(key=lambda f: -f.gain)
     pool = sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool))], key=lambda f: -f.gain)
-    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), rare
+    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(linear, place, [f for f in pool if f.place == place], base)
@@ -246,7 +247,7 @@ def _varied(pool: Sequence[Found]) -> list[Found]:
 
 
 def _proposal(
-    linear: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, float]
+    linear: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, Thresholds]
 ) -> Proposal:
     promise, c = _promise(linear, x)
     p = Proposal(place, law, tuple(map(float, c)), promise, *base)
@@ -254,7 +255,9 @@ def _proposal(
     return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(linear.target))))
 
 
-def _sums(linear: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, float]) -> list[Proposal]:
+def _sums(
+    linear: Tracked, place: Place, pool: Sequence[Found], base: tuple[float, Thresholds]
+) -> list[Proposal]:
     """Return sums of two and three terms at a place.
 
     Terms are added one by one to the best term, and to the best pairs. A pair may explain much where each of

@@ -35,6 +35,11 @@ class PlacedLaw(Placed):
     proposal: Proposal
     rivals: tuple[tuple[Proposal, Fitted, float], ...] = ()
 
+    @property
+    def log_odds(self) -> float:
+        """Return its log prior odds."""
+        return -self.proposal.cost
+
 
 def law_of(f: Fitted) -> PlacedLaw | None:
     """Return the last law of a hypothesis, None where it holds none."""
