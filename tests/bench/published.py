@@ -33,6 +33,7 @@ from scipy.signal import butter, sosfiltfilt
 from tests.bench.laws import PEERS, Predict, smoothed, values
 from tests.laws.prove import EQUAL
 from tests.laws.published import SYSTEMS, Drawn, Run, System, Values, solved
+from thermoctl.diagnosis.data.pieces import in_pieces
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
@@ -320,7 +321,8 @@ def compared(s: System, seed: int) -> dict[str, dict[str, Any]]:
     """All methods on one seed."""
     d = s.draw(seed)
     plant = plant_of(s, d)
-    first, flows = smoothed(plant, all_parts(plant, d.tables[:-1]), list(s.missing))
+    pieces, _ = in_pieces(plant, all_parts(plant, d.tables[:-1]))
+    first, flows = smoothed(plant, pieces, list(s.missing))
     t = d.runs[-1].t
     before = of_plant(first.plant, s, t)
     null = forecast_error(s, d, forecast_of_plant(first.plant, s))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
+from thermoctl.diagnosis.data.pieces import in_pieces
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, remainder
@@ -17,6 +18,7 @@ from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
 from thermoctl.diagnosis.law.find import FoundLaw, found_law
 from thermoctl.diagnosis.law.forms import LAW
+from thermoctl.diagnosis.law.refit import law_of
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
@@ -79,8 +81,9 @@ def sought(
 ) -> Sought:
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
-    chosen_on, reserve = split(tables, held_out)
+    (chosen_on, notes), (reserve, _) = (in_pieces(plant, part) for part in split(tables, held_out))
     known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
+    known.notes.extend(notes)
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
 
@@ -173,10 +176,10 @@ def _law(
     asked: Mapping[Key, float],
 ) -> FoundLaw | None:
     """Return the law among the names, with its gain over the best hypothesis without it."""
-    key = next((key for key in decision.named if key[0] == LAW), None)
-    if key is None:
+    placed = law_of(best)
+    if placed is None or placed.key not in decision.named:
         return None
-    mine = best.hypothesis.keys
+    key, mine = placed.key, best.hypothesis.keys
     without = max((w for keys, w in tried.items() if keys < mine and key not in keys), key=lambda w: w.score)
     gain = tried[mine].score - without.score
     return found_law(known, best, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))

@@ -56,12 +56,12 @@ def in_parts(plant: Plant, table: Table) -> list[Table]:
     if unknown := unread_starts(plant):
         names = ", ".join(map(repr, unknown))
         left = f"; nothing states where {names} starts after it (initial_sigma would): the rest is left out"
-        return [replace(_part(table, 0, jumps[0] + 1, 1), notes=(*table.notes, notes[0] + left))]
+        return [replace(part(table, 0, jumps[0] + 1, 1), notes=(*table.notes, notes[0] + left))]
     ends = [0, *(k + 1 for k in jumps), len(table)]
     parts = []
     for number, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True), 1):
         if end - begin >= FEW:
-            parts.append(_part(table, begin, end, number))
+            parts.append(part(table, begin, end, number))
         else:
             notes.append(f"part {number} left out: {end - begin} samples")
     if not parts:
@@ -69,7 +69,7 @@ def in_parts(plant: Plant, table: Table) -> list[Table]:
     return [replace(parts[0], notes=(*table.notes, *notes)), *(replace(p, notes=()) for p in parts[1:])]
 
 
-def _part(table: Table, begin: int, end: int, number: int) -> Table:
+def part(table: Table, begin: int, end: int, number: int) -> Table:
     columns = {n: v[begin:end] for n, v in table.columns.items()}
     meta = table.meta | ({RESTARTED: str(number)} if begin else {})
     if begin and (start := meta.get("start")):
