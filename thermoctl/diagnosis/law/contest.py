@@ -18,7 +18,8 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import refits
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.propose import Proposal, propose_laws
+from thermoctl.diagnosis.law.propose import Proposal, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import BEATEN, SURPLUS, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.plant import expression as ex
@@ -50,7 +51,43 @@ def with_laws(
         if s.best in laws:
             grow(s)
             swap(s)
+    if not any(key[0] == LAW for key in s.best.fitted.hypothesis.keys) and not case.budget.stopped():
+        say("looking for laws at two places")
+        pairs = _pairs(s, limits)
+        s.keep(pairs)
+        if s.best in pairs:
+            grow(s)
+            swap(s)
     return searched(s)
+
+
+def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
+    """Return the best hypothesis with laws at two places, and with each of these laws alone.
+
+    Where a shape is at its bound, the form that the law becomes there is refitted."""
+    case, alone = s.case, s.tried[frozenset()].fitted
+    try:
+        queue = propose_pairs(case, alone, limits)
+    except (SimulationError, np.linalg.LinAlgError):
+        return []
+    found, best = list[Weighed](), alone
+    for laws in queue:
+        f = refitted_law(case, alone, laws[0], best, laws[1:])
+        if f is None or f.absent:
+            continue
+        best = max(best, f, key=lambda x: x.log_likelihood)
+        placed = [e for e in f.hypothesis.effects if isinstance(e, PlacedLaw)]
+        limit = tuple(limit_of(e, f) for e in placed)
+        if at_bound(f) and {p.kind for p in limit} != {p.kind for p in laws}:
+            queue.append((limit[0], limit[1]))
+        elif not at_bound(f) and not f.doubtful:
+            found.append(s.weighed(f))
+    if not found:
+        return []
+    top = max(found, key=lambda w: w.score)
+    laws = [limit_of(e, top.fitted) for e in top.fitted.hypothesis.effects if isinstance(e, PlacedLaw)]
+    single = [refitted_law(case, alone, p, alone) for p in laws]
+    return [top, *(s.weighed(f) for f in single if f)]
 
 
 def _laws(

@@ -57,6 +57,7 @@ class Form:
     shapes: Mapping[str, Shape]
     memory: str | None
     odd: bool  # does the term change its sign with its signal?
+    limit: str | None = None  # the form that it becomes at the upper bound of s, with the size A / s
 
 
 @cache
@@ -87,6 +88,7 @@ def library() -> tuple[Form, ...]:
                 shapes,
                 p.get("memory"),
                 p.get("odd", False),
+                p.get("limit"),
             )
         )
     return tuple(out)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,6 +41,8 @@ PROPOSALS, SINGLE, SIGNALS = 14, 5, 4
 TERMS = 3
 ZOOMS, FINE = 2, 9  # number of finer grids of the shapes of a term; number of values of each shape in them
 CHUNK = 256  # number of terms whose responses are computed at a time
+NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
+EACH, COUPLES = 8, 6  # number of terms of each law of a pair; number of pairs
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
 
 
@@ -106,30 +109,76 @@ class Found:
 
 def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> tuple[list[Proposal], Tracked]:
     """Return the most promising laws, best first, and the linearised plant. Raises SimulationError."""
-    drives = case.drives(parent.rough.model)
-    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
-    where = places(rig)
-    nodes = [p.target for p in where if p == Place(p.target)]
-    if len(nodes) > TRACKED:
-        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
-    linear = tracked(case, parent, nodes)
+    rig, where, linear = linearised(case, parent)
     likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
     combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, linear.runs)]
     free = _ranked(linear, combos)
-    chosen = free[:COMBINATIONS]
-    pool: list[Found] = []
-    for place in dict.fromkeys(p for _, p, _ in chosen):
-        first = [s for _, p, s in chosen if p == place]
-        every = [s for _, p, s in free if p == place][:SECOND]
-        pool += _singles(linear, place, first, every)
-    pool.sort(key=lambda f: -f.gain)
-    pool = sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool))], key=lambda f: -f.gain)
+    pool = _terms(linear, free, COMBINATIONS)
     base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(linear, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
     return _mixed(out), linear
+
+
+def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
+    """Return terms over the first `count` of ranked places and signals, the best first."""
+    pool: list[Found] = []
+    for place in dict.fromkeys(p for _, p, _ in free[:count]):
+        first = [s for _, p, s in free[:count] if p == place]
+        every = [s for _, p, s in free if p == place][:SECOND]
+        pool += _singles(linear, place, first, every)
+    pool.sort(key=lambda f: -f.gain)
+    return sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool))], key=lambda f: -f.gain)
+
+
+def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[Proposal, Proposal]]:
+    """Return pairs of laws with one term each, at two nodes, best first. Raises SimulationError.
+
+    There is no pair if free flows into two nodes are less than NEEDED above those into one. Each law is
+    proposed beside a free flow into the node of the other. Both laws state the promise of the pair."""
+    rig, where, linear = linearised(case, parent)
+    likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
+    couples = {(a, b): linear.flows((a, b)) for a, b in itertools.combinations(likely, 2)}
+    alone = max(linear.flows((n,))[0] for n in likely)
+    best = max(couples, key=lambda c: couples[c][0], default=None)
+    if best is None or couples[best][0] < alone + NEEDED:
+        return []
+    combos = [(Place(n), s) for n in best for s in signals(rig, Place(n), linear.runs) if Place(n) in where]
+    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
+    each = []
+    for n, other in (best, best[::-1]):
+        beside = linear.beside(other, couples[best][1])
+        free = _ranked(beside, [c for c in combos if c[0] == Place(n)])
+        each.append([f for f in _varied(_terms(beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH])
+    out = []
+    for a, b in itertools.product(*each):
+        x = [linear.columns(f.place, _along(linear, f.term)) for f in (a, b)]
+        promise, c = _promise(linear, np.concatenate(x, axis=1))
+        laws = (
+            Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
+        )
+        out.append((next(laws), next(laws)))
+    return sorted(out, key=lambda p: p[0].cost + p[1].cost - p[0].promise)[:COUPLES]
+
+
+def _along(linear: Tracked, t: Term) -> list[np.ndarray]:
+    """Return the values (N, sizes) of a term by recording."""
+    return [t.values(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
+
+
+def linearised(case: Case, parent: Fitted) -> tuple[Structure, list[Place], Tracked]:
+    """Return the parts of a hypothesis' plant, the places of laws, and the plant about its recordings.
+
+    Raises SimulationError."""
+    drives = case.drives(parent.rough.model)
+    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
+    where = places(rig)
+    nodes = [p.target for p in where if p == Place(p.target)]
+    if len(nodes) > TRACKED:
+        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
+    return rig, where, tracked(case, parent, nodes)
 
 
 def _ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.roles import Structure
-from thermoctl.diagnosis.law.forms import law_effect, readable
+from thermoctl.diagnosis.law.forms import law_effect, library, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.files.yamlfile import InputError
@@ -46,18 +46,23 @@ def law_of(f: Fitted) -> PlacedLaw | None:
     return next((e for e in reversed(f.hypothesis.effects) if isinstance(e, PlacedLaw)), None)
 
 
-def refitted_law(case: Case, parent: Fitted, p: Proposal, leader: Fitted) -> Fitted | None:
+def refitted_law(
+    case: Case, parent: Fitted, p: Proposal, leader: Fitted, more: Sequence[Proposal] = ()
+) -> Fitted | None:
     """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
 
-    The refit ends early if it stays far from `leader`, the likeliest one so far."""
-    rig = Structure(parent.rough_plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
-    c = law_candidate(rig, p)
-    values, ranges = _start(p)
-    plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
-    own = {q: c.own(q) for q in ranges if c.own(q) in plant.parameters}
-    c = dataclasses.replace(c, effect=_bounded(c, ranges))
+    The refit ends early if it stays far from `leader`, the likeliest one so far. `more`: laws at other places
+    that are added, too."""
+    plant, effects = parent.rough_plant, parent.hypothesis.effects
+    for q in (p, *more):
+        rig = Structure(plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
+        c = law_candidate(rig, q)
+        values, ranges = _start(q)
+        plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
+        own = {name: c.own(name) for name in ranges if c.own(name) in plant.parameters}
+        effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:
-        return fitted(case, plant, (*parent.hypothesis.effects, PlacedLaw(c, own, p)), None, leader, parent)
+        return fitted(case, plant, effects, None, leader, parent)
     except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
         return None
 
@@ -94,6 +99,18 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
             low, high = shape.scaled(shape.range, next(iter(t.signals), None), t.duration)
             values[f"{q}{k}"], ranges[f"{q}{k}"] = t.shapes[q], (low, high)
     return values, ranges
+
+
+def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
+    """Return a refitted law of one term, with the form that it becomes where its shape s is at its bound."""
+    p, (term,) = law.proposal, law.proposal.terms
+    values = {q: f.plant.parameters[name].value for q, name in law.own.items()}
+    sizes = tuple(values[f"{q}1"] for q in term.form.sizes)
+    shapes = {q: values[f"{q}1"] for q in term.form.shapes}
+    if term.form.limit and f.fit.at_bound.get(law.own["s1"]) == "high":
+        form = next(x for x in library() if x.name == term.form.limit)
+        term, sizes, shapes = dataclasses.replace(term, form=form), (sizes[0] / shapes["s"],), {}
+    return dataclasses.replace(p, terms=(dataclasses.replace(term, shapes=shapes),), sizes=sizes)
 
 
 def simpler_law(p: Proposal, f: Fitted) -> Proposal:
@@ -136,8 +153,9 @@ def law_rate(f: Fitted) -> ex.Expr:
 
 
 def at_bound(f: Fitted) -> bool:
-    """Return whether a parameter of the law is at its bound: then a simpler form describes it."""
-    return bool(set(f.hypothesis.effects[-1].own.values()) & f.fit.at_bound.keys())
+    """Return whether a parameter of a law is at its bound: then a simpler form describes it."""
+    own = (e.own.values() for e in f.hypothesis.effects if isinstance(e, PlacedLaw))
+    return any(set(names) & f.fit.at_bound.keys() for names in own)
 
 
 def equation(rate: ex.Expr, f: Fitted) -> str:

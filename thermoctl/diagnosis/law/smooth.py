@@ -7,7 +7,7 @@ D: exact first-order response of the outputs to flows; S: to parameters and init
 replaces all of u^. Regression on this equation equals regression on the smoothed flow with its covariance.
 
 The prior of u^ is white. Its standard deviation is one multiple of each node's typical flow, the multiple
-with the largest marginal likelihood."""
+with the largest marginal likelihood. Initial states are free."""
 
 from __future__ import annotations
 
@@ -22,20 +22,24 @@ from scipy.sparse import csr_matrix
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, signals, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnosis.law.signals import Place
+from thermoctl.diagnosis.search.metric import Absorbed
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
+from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Flow, Input, Plant
-from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 
 LATENT = "unknown_flow_into_"
-KNOTS = 240  # number of knots of a recording, shared among the nodes
+KNOTS = 240  # number of knots of a recording, shared among the nodes, if there are MANY recordings or fewer
+MANY = 4
 FEWEST_KNOTS = 24
 ABSORBED = 1e-3  # a flow is absorbed if the projection leaves less than this share of its response's norm
-STEPS = 3  # largest number of Gauss-Newton steps of the tracking
+STEPS = 6  # largest number of Gauss-Newton steps of the tracking
 TOGETHER = 48  # number of responses that are simulated at a time
 RESOLVED = 400  # number of hat functions of a flow; 90 % of responses in a stage and in tanks err by < 0.7 %
 
@@ -48,7 +52,9 @@ class Tracked:
     - `target` (rows,): the misfit that a law has to explain
     - `runs`: by recording, every signal along the trajectory
     - `duration`, `sample`: duration of the longest recording, and largest sampling interval, s
-    - `explained`: by node, the share of |target|^2 that a free flow in time into the node explains"""
+    - `explained`: by node, the share of |target|^2 that a free flow in time into the node explains
+    - `free`: by node, the responses (rows, k) to such a flow, each knot's of typical size
+    - `beyond`: directions that a free flow into another node absorbs, or None"""
 
     metric: Rows
     target: np.ndarray
@@ -56,6 +62,8 @@ class Tracked:
     duration: float
     sample: float
     explained: dict[str, float]
+    free: dict[str, np.ndarray]
+    beyond: Absorbed | None = None
     _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @cached_property
@@ -76,8 +84,30 @@ class Tracked:
             into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
             whole = into - out[0] if out else into
             rest = self.metric.project(whole)
+            rest = self.beyond.without(rest) if self.beyond else rest
             absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
+
+    def flows(self, nodes: Sequence[str]) -> tuple[float, float]:
+        """Return the log marginal likelihood of free flows into nodes, over that of none, and their size.
+
+        The size, their prior standard deviation over the typical flow, is the likeliest of SHARES."""
+        x = np.concatenate([self.free[n] for n in nodes], axis=1)
+        square, v = np.linalg.eigh(x.T @ x)
+        square, force = np.maximum(square, 0.0), (v.T @ (x.T @ self.target)) ** 2
+
+        def score(share: float) -> float:
+            """Return the log marginal likelihood at a prior standard deviation."""
+            more = 1 + share**2 * square
+            return 0.5 * float(np.sum(force * share**2 / more - np.log(more)))
+
+        share = max(SHARES, key=score)
+        return score(share), float(share)
+
+    def beside(self, node: str, size: float) -> Tracked:
+        """Return the linearised plant with a free flow of a prior size into a node."""
+        beyond = Absorbed.by(size * self.free[node])
+        return dataclasses.replace(self, target=beyond.without(self.target), beyond=beyond)
 
     @cached_property
     def _hats(self) -> list[csr_matrix]:
@@ -164,15 +194,16 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
     if not nodes:
         raise SimulationError("the plant has no node that an unknown flow could enter")
     f = as_refitted(case, f)
+    # the refit of a plant that grows without bounds takes all of a reading for noise
+    most = [g.variance * float(np.exp(2 * g.known)) for g in case.grids]
+    noise = [min(v, m) for v, m in zip(f.average.sensor, most, strict=True)]
+    average = dataclasses.replace(f.average, sensor=noise)
     plant = with_latent(f.rough_plant, nodes)
     model = compile_plant(plant)
-    # a parameter that the refit without a law put at its bound may leave it with one
-    rough = dataclasses.replace(f.rough, model=model, at_bound={})
-    base = dataclasses.replace(f, rough=rough, rough_plant=plant)
-    knots = max(FEWEST_KNOTS, KNOTS // max(len(nodes), 1))
+    knots = max(FEWEST_KNOTS, KNOTS * MANY // max(len(case.tables), MANY) // len(nodes))
     hats = [hat_functions(t.t - t.t[0], knots) for t in case.tables]
     weights = [np.zeros((knots, len(nodes))) for _ in hats]
-    sizes: list[float] = []
+    z, sizes = f.rough.z, list[float]()
     best: tuple[float, _Followed] | None = None
     for _ in range(STEPS + 1):
         tables = tuple(
@@ -182,14 +213,14 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
             for t, h, w in zip(case.tables, hats, weights, strict=True)
         )
         try:
-            plain = Plain(dataclasses.replace(case, tables=tables), base, ROWS)
-            metric = Rows(plain, f.average, False)
+            plain = _at(dataclasses.replace(case, tables=tables), f, plant, model, z)
+            metric = Rows(plain, average, False)
         except SimulationError:
             break
         runs = [
             signals(model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
         ]
-        sizes = sizes or [typical_flow(f.rough_plant, n, runs) or 1.0 for n in nodes]
+        sizes = sizes or [typical_flow(plant, n, runs) or 1.0 for n in nodes]
         residual = [
             metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
         ]
@@ -200,10 +231,35 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
         scaled = [(w / np.array(sizes)).T.ravel() for w in weights]
         misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
         best = size, _Followed(metric, runs, misfit, wide)
-        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in _smoothed(wide, misfit)]
+        flows = _smoothed(wide, misfit, metric.own)
+        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in flows]
+        left = [e - x @ p for e, x, p in zip(misfit, wide, flows, strict=True)]
+        z = _started(plain, metric, left)
     if best is None:
         raise SimulationError("the plant cannot be tracked")
     return best[1]
+
+
+def _at(case: Case, f: Fitted, plant: Plant, model: Model, z: np.ndarray) -> Plain:
+    """Return the rows of a plant at its parameters' values, with the initial states of z."""
+    problem = Problem(model, case.drives(model), case.noise)
+    z = np.concatenate([problem.z_plant[: problem.n_parameters], z[problem.n_parameters :]])
+    values, dx0 = problem.unpack(z)
+    # a parameter that the refit without a law put at its bound may leave it with one
+    rough = dataclasses.replace(f.rough, model=model, values=values, dx0=dx0, z=z, at_bound={})
+    return Plain(case, dataclasses.replace(f, rough=rough, rough_plant=plant), ROWS)
+
+
+def _started(plain: Plain, metric: Rows, left: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the unknowns after a step of the initial states to errors (rows,) that flows leave."""
+    z, first = metric.fit.z.copy(), plain.problem.n_parameters
+    edges = np.cumsum([len(e) for e in left])[:-1]
+    for r, (e, weight) in enumerate(zip(left, np.split(metric.weight, edges), strict=True)):
+        ks = plain.unknowns(r)
+        x = plain.sensitivities[r][:, ks >= first] * weight[:, None]
+        ks = ks[ks >= first]
+        z[ks] = np.clip(z[ks] + np.linalg.lstsq(x, e, rcond=1e-8)[0], -FAR, FAR)
+    return z
 
 
 def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
@@ -213,11 +269,9 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     duration = max(float(d.t[-1]) for d in followed.metric.drives)
     sample = max(float(np.median(np.diff(d.t))) for d in followed.metric.drives)
     of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in followed.wide), strict=True)
-    explained = {
-        n: _explained(followed.metric.project(block_diag(*x)), target)
-        for n, x in zip(nodes, of_nodes, strict=True)
-    }
-    return Tracked(followed.metric, target, followed.runs, duration, sample, explained)
+    free = {n: followed.metric.project(block_diag(*x)) for n, x in zip(nodes, of_nodes, strict=True)}
+    explained = {n: _explained(x, target) for n, x in free.items()}
+    return Tracked(followed.metric, target, followed.runs, duration, sample, explained, free)
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
@@ -245,8 +299,11 @@ def law_unit(plant: Plant, place: Place) -> str | None:
 
 
 def _explained(x: np.ndarray, target: np.ndarray) -> float:
-    u, s, _ = np.linalg.svd(x, full_matrices=False)
-    along = u[:, s > ABSORBED * s[0]].T @ target
+    square, v = np.linalg.eigh(
+        x.T @ x
+    )  # a decomposition of x itself costs seconds if it has thousands of columns
+    seen = square > ABSORBED**2 * square[-1]
+    along = (v[:, seen].T @ (x.T @ target)) / np.sqrt(square[seen])
     return float(along @ along) / max(float(target @ target), 1e-300)
 
 
@@ -278,12 +335,15 @@ def _wide(
     return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
 
 
-def _smoothed(wide: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _smoothed(
+    wide: Sequence[np.ndarray], targets: Sequence[np.ndarray], own: Sequence[Absorbed]
+) -> list[np.ndarray]:
     """Return the posterior mean of the knots' flows by recording, in units of the typical flows.
 
-    The prior's standard deviation has the largest marginal likelihood of SHARES."""
-    parts = [np.linalg.svd(x, full_matrices=False) for x in wide]
-    along = [u.T @ e for (u, _, _), e in zip(parts, targets, strict=True)]
+    The prior's standard deviation has the largest marginal likelihood of SHARES. `own`: the directions that
+    each recording's own unknowns absorb."""
+    parts = [np.linalg.svd(q.without(x), full_matrices=False) for q, x in zip(own, wide, strict=True)]
+    along = [u.T @ q.without(e) for (u, _, _), q, e in zip(parts, own, targets, strict=True)]
 
     def score(share: float) -> float:
         """Return twice the log marginal likelihood at a prior standard deviation, up to a constant."""
