@@ -344,7 +344,7 @@ def make_case(
         "snr_learnt": round(told["learnt"], 2) if "learnt" in told else None,
         "onset": told["onset"],
         "also_right": [list(x) for x in told["aliases"]],
-        "parameters": [{k: float(v) for k, v in published(e, p).items()} for e, _, p in effects],
+        "parameters": [{k: float(f"{v:.7g}") for k, v in published(e, p).items()} for e, _, p in effects],
         "true_parameters": {k: float(f"{v:.6g}") for k, v in scene.theta.items()},
     }
     if opened is not None:
