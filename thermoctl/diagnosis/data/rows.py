@@ -12,12 +12,14 @@ A block ends where an input jumps, so that it does not mix readings from before 
 rows left before a jump, fewer than a block, give no value. A held input keeps the exact times of its changes:
 each has a row of its own, without outputs. An input that changes too often for that is averaged.
 
-`block` is the largest number that passes three tests in every recording:
+`block` is the largest number that passes four tests in every recording:
 
 - The plant's error is white above half of the new highest frequency. No band of DCT rows there has more
   power than the highest half of all rows, and no single row (an oscillation) has (Fisher 1929).
 - Averaged inputs vary within a block by little: AVERAGED of their variance. So functions that are not linear
   in an input keep their mean.
+- Averaged inputs leave the run of the refitted plant as it is. The differences of an output in a recording
+  have together less than the energy BENT of a reading's noise.
 - The means keep the information on each parameter and initial state, and on a delay of each output. The
   information is 1 / diag([J'J + prior]^-1), with all other unknowns free. A delay changes a reading in
   proportion to its slope, as fast as any effect does.
@@ -57,6 +59,7 @@ HALF_BAND = 2.0  # the new highest frequency over that of the fastest content
 WHITE = 1.1  # a band is white up to so many times the power of the highest rows
 CHANCE = 1e-3  # chance that white noise of any output in any recording fails the tests of bands or of rows
 AVERAGED = 1e-3  # share of an input's variance that averaging may remove: its mean square is as exact
+BENT = 1.0  # largest sum of squares of what averaged inputs change in an output, over its noise
 OUTLIER = 6.0  # a cell so many robust standard deviations from the median of its neighbours is dropped
 GAP = 1.5  # a block that lasts so many times the usual duration lacks rows: it gives no value
 
@@ -154,13 +157,27 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
 
     def enough(b: int) -> bool:
         """Return whether means of b rows keep the information on each unknown."""
-        if not _allowed(d, b):
+        if not _allowed(d, b) or _bent(of[0], of[1], b, (values, dx0), run.y) > BENT:
             return False
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 
     sizes = _sizes(min(coarse, int(len(d.t) / (HALF_BAND * content + 1))))
     first = bisect_left(sizes, True, key=enough)  # the larger a block, the more information is lost
     return sizes[first] if first < len(sizes) else 1
+
+
+def _bent(
+    model: Model, table: Table, block: int, start: tuple[np.ndarray, np.ndarray], y: np.ndarray
+) -> float:
+    """Return by how much averaged inputs change a run: sum of squares over the noise, of the worst output.
+
+    `start`: parameters and shifts of initial states of the run by all rows, y (N, outputs)."""
+    few = means(model, table, block, *start)
+    d = model.excitation(few)
+    change = model.run(d, *start).y - y[np.searchsorted(table.t, few.t)]
+    noise = Reduced([few], block, 0, 0).noise(model.plant, [model.excitation(table)])
+    squares = np.where(np.isfinite(d.y), change / [n.sigma for n in noise], 0.0) ** 2
+    return float(squares.sum(axis=0).max())
 
 
 def _sizes(most: int) -> list[int]:
