@@ -12,10 +12,11 @@ remainder (noise.py). Its maximum is found in posterior.py.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc, chdtri
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.memory import Past, PlacedBefore
@@ -42,6 +43,7 @@ WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise, 
 SHARE = 0.01  # share of an effect's size from which the first step towards its full size is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOVES = 2  # largest number of refits after times of jumps were moved
+TINY = 1e-300
 LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -67,13 +69,13 @@ class Fitted:
     @property
     def absent(self) -> bool:
         """Return whether a whole effect is not significant."""
-        return any(_insignificant(self, e, all) for e in self.hypothesis.effects)
+        return any(_insignificant(self, e, _none_stands) for e in self.hypothesis.effects)
 
     @property
     def doubtful(self) -> bool:
         """Return whether a part of an effect is not significant: a simpler hypothesis may replace it."""
         return any(
-            _insignificant(self, e, any)
+            _insignificant(self, e, _one_does_not_stand)
             or any(
                 p.at_zero and p.name in e.own and _near_null(self, e, p)
                 for p in e.candidate.effect.parameters
@@ -87,8 +89,11 @@ class Fitted:
         return self.log_likelihood + self.log_prior + self.volume + self.past.log_evidence
 
 
-def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]) -> bool:
-    """Return whether any, or all, amplitudes of the effect are within SIGNIFICANT sd of no effect.
+Amplitudes = Callable[[Fitted, Placed, Sequence[EffectParameter]], bool]
+
+
+def _insignificant(f: Fitted, e: Placed, which: Amplitudes) -> bool:
+    """Return whether one, or none, of the amplitudes of the effect stands out of no effect.
 
     An effect without an amplitude (lag, delay) is insignificant if a parameter is at its lower bound. So is a
     periodic effect with a period at its upper bound: the period does not repeat in the recordings. So is an
@@ -105,13 +110,45 @@ def _insignificant(f: Fitted, e: Placed, which: Callable[[Iterable[bool]], bool]
         return False
     if not sizes:
         return any(f.fit.at_bound.get(n) == "low" for n in e.own.values())
-    return which(_near_null(f, e, p) for p in sizes)
+    return which(f, e, sizes)
 
 
 def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
     """Return whether a parameter is within SIGNIFICANT sd of the value at which it changes nothing."""
+    return abs(_distance(f, e, p)) < SIGNIFICANT
+
+
+def _one_does_not_stand(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
+    """Return whether an amplitude is within SIGNIFICANT sd of no effect; those of one direction are one."""
+    if len(e.candidate.effect.dims) == 1:
+        return _none_stands(f, e, sizes)
+    return any(_near_null(f, e, p) for p in sizes)
+
+
+def _none_stands(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
+    """Return whether all amplitudes together are as near to no effect as one within SIGNIFICANT sd of it.
+
+    Storage and conductance of a hidden mass replace each other: each is uncertain, both are certain together.
+    So the square of their distance from no effect has the metric of their correlations."""
+    columns = [q for q, r in f.fit.unknowns if r is None]
+    own = [e.own[p.name] for p in sizes]
+    if not set(own) <= set(columns):  # an amplitude for each recording
+        return all(_near_null(f, e, p) for p in sizes)
+    of_effects = {n for x in f.hypothesis.effects for n in x.own.values()}
+    moves = np.array([q not in f.fit.at_bound or q in of_effects for q in columns])
+    inverse = np.linalg.pinv(f.curvature[np.ix_(moves, moves)], hermitian=True)
+    at = [[q for q, m in zip(columns, moves, strict=True) if m].index(q) for q in own]
+    spread = inverse[np.ix_(at, at)]
+    size = np.sqrt(np.maximum(np.diag(spread), TINY))
+    away = np.array([_distance(f, e, p) for p in sizes])
+    square = away @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ away
+    return bool(square < chdtri(len(sizes), chdtrc(1, SIGNIFICANT**2)))
+
+
+def _distance(f: Fitted, e: Placed, p: EffectParameter) -> float:
+    """Return how far a parameter is from the value at which it changes nothing, in standard deviations."""
     own = e.own[p.name]
-    return abs(f.plant.parameters[own].value - p.null) < SIGNIFICANT * f.sd[own]
+    return (f.plant.parameters[own].value - p.null) / max(f.sd[own], TINY)
 
 
 def fitted(
