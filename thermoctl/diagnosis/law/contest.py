@@ -71,14 +71,14 @@ def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
     except (SimulationError, np.linalg.LinAlgError):
         return []
     found, best = list[Weighed](), alone
-    for laws in queue:
-        f = refitted_law(case, alone, laws[0], best, laws[1:])
+    for pair in queue:
+        f = refitted_law(case, alone, pair[0], best, pair[1:])
         if f is None or f.absent:
             continue
         best = max(best, f, key=lambda x: x.log_likelihood)
         placed = [e for e in f.hypothesis.effects if isinstance(e, PlacedLaw)]
         limit = tuple(limit_of(e, f) for e in placed)
-        if at_bound(f) and {p.kind for p in limit} != {p.kind for p in laws}:
+        if at_bound(f) and {p.kind for p in limit} != {p.kind for p in pair}:
             queue.append((limit[0], limit[1]))
         elif not at_bound(f) and not f.doubtful:
             found.append(s.weighed(f))
