@@ -7,8 +7,7 @@ The damping l is lowered after a good step and raised after a failure. The valle
 and a straight step leaves them. So half the geodesic acceleration a is added (Transtrum & Sethna 2012,
 arXiv:1201.5885). A coordinate that meets its bound is held there until the gradient leads back inside. A
 climb ends where a step without damping promises less than a limit. A small gain of a damped step does not
-end it. It ends early where a goal is out of reach: after slow steps, or where SLOW times that promise does
-not lead there.
+end it.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ EASED, RAISED = 0.2, 8.0  # factor on the damping after a step that gains half o
 TRIES = 12  # largest number of dampings that are tried for one step
 STRAIGHT = 0.75  # after a step that gains this share of its promise, the next one is not bent
 CURVED = 0.75  # largest acceleration, as a share of the step
-SLOW = 20.0  # a step is slow if more than this many such steps are needed to a goal
+SLOW = 20.0  # a step is slow if more than this many such steps are needed
 SLOW_STEPS = 3  # end after so many slow steps in a row
 INSIDE = 1e-9  # least share of the gradient that is not a rounding error, for a slope at a bound
 
@@ -96,8 +95,7 @@ def climb(
     while True:
         step, _ = bounded_step(spot.z, gradient, matrix, 0.0, hill.bounds)
         left, least = _promise(gradient, matrix, step), enough(spot.height)
-        hopeless = spot.height + SLOW * left < goal
-        if left < least or hopeless or slow >= SLOW_STEPS:
+        if left < least or slow >= SLOW_STEPS:
             return Climbed(spot, gradient, matrix, done, left, left < least or spot.height >= goal)
         if done >= steps or time.thread_time() > deadline:
             return Climbed(spot, gradient, matrix, done, left, False)
