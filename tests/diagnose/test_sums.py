@@ -12,6 +12,7 @@ from thermoctl.diagnosis.evidence.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.law.smooth import _smoothed
 from thermoctl.diagnosis.run import diagnose
+from thermoctl.diagnosis.search.metric import Absorbed
 from thermoctl.diagnosis.search.overlay import _filtered
 from thermoctl.diagnosis.search.screening import FREE, ROWS, Plain, Rows
 from thermoctl.plant.fitting import residuals
@@ -79,8 +80,10 @@ def test_a_diagnosis_that_keeps_no_sensitivities_has_the_same_findings(tmp_path,
 def test_unknown_flows_of_each_recording_are_solved_alone_as_if_together():
     rng = np.random.default_rng(2)
     wide, targets = [rng.standard_normal((40, 6)) for _ in range(3)], list(rng.standard_normal((3, 40)))
-    together = _smoothed([block_diag(*wide)], [np.concatenate(targets)])
-    assert np.allclose(np.concatenate(_smoothed(wide, targets)), together[0])
+    starts = [rng.standard_normal((40, 2)) for _ in range(3)]
+    together = _smoothed([block_diag(*wide)], [np.concatenate(targets)], [Absorbed.by(block_diag(*starts))])
+    alone = _smoothed(wide, targets, [Absorbed.by(x) for x in starts])
+    assert np.allclose(np.concatenate(alone), together[0])
 
 
 def test_steps_that_are_joined_in_pairs_give_the_same_lag_as_one_after_the_other():
