@@ -70,6 +70,7 @@ def in_parts(plant: Plant, table: Table) -> list[Table]:
 
 
 def part(table: Table, begin: int, end: int, number: int) -> Table:
+    """Return rows `begin` to `end` of a recording as its part `number`, which starts at its first row."""
     columns = {n: v[begin:end] for n, v in table.columns.items()}
     meta = table.meta | ({RESTARTED: str(number)} if begin else {})
     if begin and (start := meta.get("start")):
