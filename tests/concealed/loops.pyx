@@ -10,7 +10,8 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-DEF FEW_ROWS = 16
+cdef enum:
+    FEW_ROWS = 16
 
 
 # ------------------------------------------------------------------------------------------ thermal networks

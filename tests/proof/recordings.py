@@ -6,15 +6,15 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.proof.rigs import RIGS, Rig
 from tests.proof.score import CONFIDENT
+from tests.truth.run import diagnose
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
-from thermoctl.fleet.batch import OnCase, run_all, run_one
+from thermoctl.fleet.batch import OnCase, run_all
 from thermoctl.fleet.jobs import Job, Run, outcome
 
 VARIABLE = "THERMOCTL_RECORDINGS"  # of the environment: the folder of the recordings
@@ -66,7 +66,7 @@ def real(
             f"{folder}: none of the known rigs is here ({', '.join(sorted({r.folder for r in RIGS}))})"
         )
     jobs = [rig_job(folder, r) for r in rigs]
-    run_all(jobs, out / "cases", scheduler, workers, partial(run_one, report=False), progress)
+    run_all(jobs, out / "cases", scheduler, workers, diagnose, progress)
     entries = [_entry(r, *outcome(j, out / "cases")) for r, j in zip(rigs, jobs, strict=True)]
     write_text(out / "real.json", json.dumps([asdict(e) for e in entries], indent=1) + "\n")
     return entries

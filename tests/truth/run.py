@@ -1,4 +1,4 @@
-"""Diagnose one case without report and experiment, and keep what the table needs; keep its search, too."""
+"""Diagnose one case without report, experiment and test for swapped columns; keep result and search."""
 
 from __future__ import annotations
 

@@ -55,7 +55,6 @@ def diagnose(
     limits: Ranges = NONE,
     stopped: Callable[[], bool] = lambda: False,
     earlier: Path | None = None,
-    report: bool = True,
     anyway: bool = False,
 ) -> dict[str, Any]:
     """Diagnose recordings, write the result into the folder `out` (all files or none), return it.
@@ -66,7 +65,6 @@ def diagnose(
     - `limits`: ranges of inputs and outputs in the next experiment
     - `stopped`: once true, the result is that of the hypotheses tried so far, with a note
     - `earlier`: the folder of an earlier diagnosis, which goes on with these recordings
-    - `report`: write report.html, too
     - `anyway`: write the result even where wrong columns explain the recordings better than physics
 
     Raises InputError for unusable inputs."""
@@ -103,20 +101,17 @@ def diagnose(
         not_seen(diagnosis) if diagnosis.decision.verdict == "consistent" and not stopped() else []
     )
     result["seconds"] = round(time.monotonic() - started, 1)
-    _write(folder, plant, diagnosis, result, proposed, report)
+    _write(folder, plant, diagnosis, result, proposed)
     return result
 
 
-def _write(
-    folder: Path, plant: Plant, diagnosis: Diagnosis, result: dict[str, Any], proposed: Any, report: bool
-) -> None:
+def _write(folder: Path, plant: Plant, diagnosis: Diagnosis, result: dict[str, Any], proposed: Any) -> None:
     """Write all files of a result, or none."""
     with whole_files(folder, remove=experiment_file.FILES) as part:
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in diagnosis.shown)
         save(diagnosis.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
-        if report:
-            _report(diagnosis, result, part / "report.html")
+        _report(diagnosis, result, part / "report.html")
         write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         memory.write(part, plant, _remembered(diagnosis))
         if proposed:
@@ -152,12 +147,11 @@ def diagnose_files(
     out: str | Path,
     effects: Sequence[Path] = (),
     held_out: Sequence[str | Path] = (),
-    report: bool = True,
 ) -> dict[str, Any]:
     """Diagnose recordings that are named by their files. Raises InputError."""
     plant = load(plant_file)
     tables, reserve = read_recordings(plant, recordings), read_recordings(plant, held_out)
-    return diagnose(plant, tables, out, effects, reserve, report=report)
+    return diagnose(plant, tables, out, effects, reserve)
 
 
 def writable(folder: Path) -> Path:

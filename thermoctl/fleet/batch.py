@@ -26,14 +26,14 @@ RETRIES = 3  # number of workers that may die on one case before it counts as fa
 OnCase = Callable[[int, int, Run], None]  # cases done, cases to do, the newest
 
 
-def run_one(job: Job, out: str, report: bool = True) -> Run:
+def run_one(job: Job, out: str) -> Run:
     """Diagnose one case in this process; OUT/run.json is written last. A bad case raises nothing.
 
     `cpu_s` there is the processor time of this process and its children, such as the compiler."""
     started, cpu = time.monotonic(), _cpu()
     error = None
     try:
-        diagnose_files(job.plant, job.recordings, out, [Path(e) for e in job.effects], job.held_out, report)
+        diagnose_files(job.plant, job.recordings, out, [Path(e) for e in job.effects], job.held_out)
     except InputError as e:
         error = str(e)
     except Exception as e:  # a crash of one does not end the others

@@ -65,7 +65,7 @@ def _pieces(model: Model, table: Table, d: Excitation, sigma: np.ndarray) -> tup
 def _growth(model: Model, d: Excitation, sigma: np.ndarray) -> np.ndarray:
     """Return the largest growth (N,) so far of an error of the start; empty where a simulation fails."""
     try:
-        run = model.run(model.prepare(d), None, None, sensitivities=True)
+        run = model.run(model.prepare(d), None, None, sensitivities=True, states=False)
     except SimulationError:
         return np.zeros(0)
     assert run.dy is not None
