@@ -224,9 +224,12 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     )
 
 
-def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
+@pytest.mark.parametrize(("period", "size", "rows"), [(0.25e-3, 3e-6, 6000), (0.06e-3, 0.3e-6, 500)])
+def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path, monkeypatch, period, size, rows):
+    """The shorter one passes more than once in a sample, and 8 samples are summed in a row of the screening."""
+    monkeypatch.setattr("thermoctl.diagnosis.search.screening.ROWS", rows)
     (tmp_path / "plant.yaml").write_text(SPRING_STAGE)
-    t, period = np.arange(0.0, 20.0, 0.005), 0.25e-3
+    t = np.arange(0.0, 20.0, 0.005)
     paths = [tmp_path / "plant.yaml"]
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
@@ -241,7 +244,7 @@ def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
             0.005,
         )
         x = dlsim((A, B, C, D, 0.005), force)[1][:, 0]
-        y = x + 3e-6 * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
+        y = x + size * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
         assert np.ptp(x) > 70 * period
         paths.append(tmp_path / f"run_{seed}.csv")
         np.savetxt(
@@ -257,7 +260,7 @@ def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path):
         ("cyclic_error", "encoder")
     ]
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
-    assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(3e-6, rel=0.1)
+    assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(size, rel=0.1)
 
 
 def test_dry_friction_that_sticks_is_no_load(tmp_path):

@@ -17,8 +17,10 @@ from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.search.again import Known
+from thermoctl.diagnosis.search.fine import above, fine
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Absorbed, Metric, Pushed, without
+from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Keep, Norms, Select, ignored, screen
 from thermoctl.diagnosis.search.sketch import likeliest
 from thermoctl.plant.fitting.residuals import Problem
@@ -269,6 +271,10 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
             for d, p in again
             if p > by_key.get(d.candidate.key, 0.0)
         ]
+    upper = above(case.coordinates, refitted.average.inverse, plain.coordinates)
+    trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))] if upper else []
+    picked = (d for c in placed for d in fine(metric, trajectories, c, upper))
+    promised += [(d, 0.5 * d.gain - float(np.log(10)) * d.elsewhere) for d in picked]
     promised.sort(key=lambda x: -x[1])
     return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy, norms)
 
