@@ -24,7 +24,7 @@ from types import FrameType
 
 EVERY = 0.005  # s of processor time between two samples
 HERE = Path(__file__).parents[2]
-# of the innermost frame that is in one of them: a part of the file's path, name of the function ("" is any)
+# of the innermost frame that is in one of them: a part of the file's path in the package, name of the function ("" is any)
 STAGES = (
     ("/compile.py", "", "compiler"),
     ("/build.py", "", "compiler"),
@@ -60,8 +60,9 @@ def stage(frame: FrameType | None) -> str:
         if file.endswith("/simulate.py") and name in ("_run", "respond"):
             slopes = name == "respond" or frame.f_locals.get("sensitivities")
             return "with slopes" if slopes else "simulate"
+        own = "".join(file.rpartition("/thermoctl/")[1:]) if "/thermoctl/" in file else ""
         for part, function, label in STAGES:
-            if part in file and function in ("", name):
+            if part in own and function in ("", name):
                 return label
         frame = frame.f_back
     return "else"

@@ -30,7 +30,7 @@ outputs: {T_block: {value: T, unit: degC, noise: 0.2}}
 RADIATES = BLOCK.replace(
     "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
 )
-# Rectangles of all visible texts, each with what cuts it: the page's edge, the drawing or the box that it is in.
+# Rectangles of all visible texts, each with what cuts it: the page's edge, the drawing or the box that it is in; letters below 9 px.
 LOOK = """(() => {
   const texts = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), faults = [];
   while (walker.nextNode()) {
@@ -43,6 +43,8 @@ LOOK = """(() => {
       const box = (svg || (wide && wide.scrollWidth <= wide.clientWidth ? wide : document.documentElement)).getBoundingClientRect();
       const text = node.textContent.trim().slice(0, 40);
       if (r.left < box.left - 1.5 || r.right > box.right + 1.5) faults.push('cut: ' + text);
+      const scale = svg ? svg.getBoundingClientRect().width / svg.viewBox.baseVal.width : 1;
+      if (scale * parseFloat(getComputedStyle(parent).fontSize) < 9) faults.push('small: ' + text);
       texts.push({r, node, text});
     }
   }

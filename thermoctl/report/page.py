@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 # Colours in figures, and their variables in the style sheet: each theme has shades of its own.
 BLACK, GREY, ORANGE, BLUE, FAINT = "#1b1f24", "#7d8894", "#c7621b", "#0b6bcb", "#d9d9d9"
@@ -28,6 +29,9 @@ _VARIABLES = {
     "#b3261e": "bad",
     "#ffffff": "bg",
 }
+HALF, THIRD, HEIGHT = 4.4, 3.2, 2.4  # inches of panels: two or three stand side by side on a screen
+TICKS = 6  # largest number of intervals between the numbers at an axis
+LETTER, LINE = 0.08, 0.2  # inches that a digit and a line of text take
 _STYLE = Path(__file__).with_name("style.css")
 _NUMERIC = re.compile(r"^[-+−±<>≤ \d.,:/()%…eE·–]*$")
 _UNIT = re.compile(r"\b(degC|um|us|ohm)\b")
@@ -39,6 +43,7 @@ _TEXT: Any = {  # style of figures: one size of letters, no frame
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), GREY),
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor", "axes.labelcolor", "text.color"), BLACK),
+    "axes.titley": 1.0,
     "path.simplify": False,
     "svg.fonttype": "none",
     "svg.hashsalt": "thermoctl",
@@ -111,22 +116,57 @@ def unit(name: str | None) -> str:
     return "" if text == "1" else text.replace("(unit_of_y)", "reading").replace("unit_of_y", "reading")
 
 
-def sheet(width: float, height: float, *panels: int, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Return a matplotlib Figure in the pages' style, sizes in inches, and its panels (rows, columns)."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(_TEXT):
-        fig = Figure(figsize=(width, height), layout="constrained")
-        return fig, list(fig.subplots(*(panels or (1, 1)), squeeze=False, **how).flat)
-
-
 def figure(fig: Figure, caption: str = "", narrow: Figure | None = None) -> str:
     """Return a matplotlib figure as inline SVG with its caption; `narrow`: the figure for telephones."""
     body = _svg(fig)
     if narrow:
         body = f'<div class="broad">{body}</div><div class="narrow">{_svg(narrow)}</div>'
+    return _captioned(body, caption)
+
+
+def panel(width: float = HALF) -> Axes:
+    """Return the axes of a new panel in the pages' style, `width` in inches."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_TEXT):
+        return Figure(figsize=(width, HEIGHT)).add_subplot()
+
+
+def panels(every: Sequence[Axes], caption: str) -> str:
+    """Return panels as inline SVG, side by side where there is room, below the legend of the first."""
+    lines = zip(*every[0].get_legend_handles_labels(), strict=True)
+    legend = "".join(_legend(line, label) for line, label in lines)
+    _make_room(every)
+    drawn = "".join(_svg(axes.figure) for axes in every)
+    return _captioned(f'<p class="legend">{legend}</p><div class="panels">{drawn}</div>', caption)
+
+
+def _captioned(body: str, caption: str) -> str:
     return f"<figure>{body}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _legend(line: Line2D, label: str) -> str:
+    """Return a line's label beside a piece of the line."""
+    kind = {"--": "dashed", "None": "dotted"}.get(line.get_linestyle(), "solid")
+    style = f"border-top:{max(line.get_linewidth(), 1)}pt {kind} {_themed(line.get_color())}"
+    return f'<span><i style="{style}"></i>{html.escape(label)}</span>'
+
+
+def _make_room(every: Sequence[Axes]) -> None:
+    """Place axes beside their texts, by numbers of letters: layouts of matplotlib's draw all three times."""
+    letters = 0
+    for axes in every:
+        axes.locator_params(nbins=TICKS)
+        numbers = axes.yaxis.get_major_formatter().format_ticks(axes.yaxis.get_majorticklocs())
+        letters = max(letters, *map(len, numbers))
+    left, low, high = LETTER * letters + 1.5 * LINE, 2.3 * LINE, HEIGHT - 3.6 * LINE
+    for axes in every:
+        whole = axes.figure.get_figwidth()
+        width = whole - left - LINE
+        axes.set_position((left / whole, low / HEIGHT, width / whole, high / HEIGHT))
+        axes.yaxis.set_label_coords((0.7 * LINE - left) / width, 0.5)
+        axes.xaxis.set_label_coords(0.5, (1.1 * LINE - low) / high)
 
 
 def _svg(fig: Figure) -> str:
@@ -137,7 +177,12 @@ def _svg(fig: Figure) -> str:
         axis.spines[["top", "right"]].set_visible(False)
     out = io.StringIO()
     with matplotlib.rc_context(_TEXT):
-        fig.savefig(out, format="svg", bbox_inches="tight", transparent=True, metadata={"Date": None})
+        fig.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     svg = out.getvalue()
     svg = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(\.\d)\d+", r"\1", m[0]), svg[svg.index("<svg") :])
-    return re.sub("|".join(_VARIABLES), lambda m: f"var(--{_VARIABLES[m[0]]},{m[0]})", svg)
+    return _themed(svg)
+
+
+def _themed(text: str) -> str:
+    """Return a text with the page's colours in the place of a figure's."""
+    return re.sub("|".join(_VARIABLES), lambda m: f"var(--{_VARIABLES[m[0]]},{m[0]})", text)

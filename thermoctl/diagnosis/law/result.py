@@ -22,7 +22,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
-from thermoctl.report.page import BLUE, FAINT, GREY, figure, sheet, table, unit
+from thermoctl.report.page import BLUE, FAINT, GREY, panel, panels, table, unit
 
 EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 
@@ -119,16 +119,15 @@ def _drawing(law: FoundLaw) -> str:
     c = law.curve
     if c is None:
         return ""
-    fig, (axis,) = sheet(5, 3.2)
+    axes = panel()
     band = (c.flow - WIDE * c.sd, c.flow + WIDE * c.sd)
-    axis.fill_between(c.at, *band, color=FAINT, lw=0, label="any function, 95 %")
-    axis.plot(c.at, c.flow, ".", color=GREY, label="any function")
-    axis.plot(c.at, c.law, color=BLUE, label="law")
-    axis.set_xlabel(f"{c.signal.label} ({unit(c.signal.unit)})" if c.signal.unit else c.signal.label)
-    axis.set_ylabel(f"flow ({unit(law.unit)})" if law.unit else "flow")
-    fig.legend(*axis.get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
-    return figure(
-        fig,
+    axes.fill_between(c.at, *band, color=FAINT, lw=0)
+    axes.plot(c.at, c.flow, ".", color=GREY, label="any function, and its 95 %")
+    axes.plot(c.at, c.law, color=BLUE, label="law")
+    axes.set_xlabel(f"{c.signal.label} ({unit(c.signal.unit)})" if c.signal.unit else c.signal.label)
+    axes.set_ylabel(f"flow ({unit(law.unit)})" if law.unit else "flow")
+    return panels(
+        [axes],
         "The flow as a free function of the signal, and the law. Parts that the plant's own parameters absorb are the law's.",
     )
 

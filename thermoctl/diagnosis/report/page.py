@@ -17,18 +17,20 @@ from thermoctl.diagnosis.experiment.file import peaks
 from thermoctl.diagnosis.law.result import law_section
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.figures import Output, Rows, chance, outputs
-from thermoctl.diagnosis.report.plots import BROAD, NARROW, compared, remaining
+from thermoctl.diagnosis.report.plots import compared, remaining
 from thermoctl.diagnosis.report.words import listed, name, sentences, what_next
 from thermoctl.diagnosis.result import Diagnosis, curves
 from thermoctl.files.safe_file import write_text
 from thermoctl.plant.fitting.estimate import Estimate, correlations, report
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.show import drawing
-from thermoctl.report.page import figure, folded, page, sheet, table, unit
+from thermoctl.report.page import BLUE, figure, folded, page, panel, panels, table, unit
+from thermoctl.report.residuals import titled
 
 SHOWN = 4  # largest number of further curves, those with the largest errors
 # Least change of a parameter by a finding that is reported: in standard deviations, and relative.
 MOVED, MOVED_SHARE = 4.0, 0.25
+BROAD, NARROW = 10.0, 3.6  # widths of the network in inches: on a screen, and on a telephone
 WORTH = 0.5  # least correlation whose number is written into its cell
 TONES = {"consistent": "good", "explained": "good", "unexplained": "bad"}
 
@@ -37,7 +39,7 @@ def write_report(diagnosis: Diagnosis, result: Mapping[str, Any], path: str | Pa
     """Write report.html of a diagnosis; `result`: the content of its diagnosis.json."""
     drawn = _ordered(curves(diagnosis), outputs(result), figures.extends(result))
     more = "".join(_compared(c, result) for c in drawn[1:])
-    rest = folded(f"{len(drawn) - 1} more curves", f'<div class="grid">{more}</div>' if more else "")
+    rest = folded(f"{len(drawn) - 1} more curves", more)
     law = (result["remainder"] or {}).get("law")
     sections = [
         ("", _lead(result) + "".join(_compared(c, result, True) for c in drawn[:1])),
@@ -94,7 +96,7 @@ def _compared(c: Curve, result: Mapping[str, Any], first: bool = False) -> str:
     text = f"{c.output} in {c.recording}, simulated on the recorded inputs alone. {how}"
     if first and any(c.fit_percent(k) is not None for k in c.errors):
         text += " Percentages: fit, 100 (1 − |error| / |reading − its mean|)."
-    return compared(c, text, first)
+    return compared(c, text)
 
 
 def _next(result: Mapping[str, Any]) -> str:
@@ -261,16 +263,12 @@ def _experiment(entry: Mapping[str, Any] | None) -> str:
     moving = {n: c for n, c in corners.items() if len(c) > 1 and np.ptp(c[:, 1]) > 0}
     if not moving:
         return body
-    drawn = []
-    for width in (BROAD, NARROW):
-        fig, axes = sheet(width, 0.8 + 1.1 * len(moving), len(moving), 1, sharex=True)
-        for axis, (n, c) in zip(axes, moving.items(), strict=True):
-            axis.plot(c[:, 0], c[:, 1], lw=1.2)
-            axis.set_ylabel(n)
-        axes[-1].set_xlabel("time (s)")
-        drawn.append(fig)
-    return body + figure(
-        drawn[0], "The inputs of the proposed experiment, inside the range of the recorded ones.", drawn[1]
+    drawn = [panel() for _ in moving]
+    for axes, (n, c) in zip(drawn, moving.items(), strict=True):
+        axes.plot(c[:, 0], c[:, 1], lw=1.2, color=BLUE)
+        titled(axes, "", "time (s)", n)
+    return body + panels(
+        drawn, "The inputs of the proposed experiment, inside the range of the recorded ones."
     )
 
 

@@ -8,14 +8,12 @@ import numpy as np
 
 from thermoctl.diagnosis.curves import Curve
 from thermoctl.diagnosis.report.figures import COLUMNS, WIDE, percent
-from thermoctl.report.page import BLUE, FAINT, GREY, ORANGE, figure, sheet, unit
+from thermoctl.report.page import BLUE, FAINT, GREY, ORANGE, THIRD, panel, panels, unit
 from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, titled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-BROAD, NARROW = 10.0, 3.6  # widths of a figure in inches: on a screen, and on a telephone
 POINTS = 200  # number of buckets of a curve, each drawn by its smallest and its largest value
 DOTS = 300  # largest number of measured values that are drawn
 ROOM = 0.15  # margin above and below the readings, over their range; simulations outside are cut off
@@ -26,19 +24,13 @@ SHADES = {"before": GREY, "refit_only": ORANGE, "after": BLUE}
 SCALES = ((2 * 86400.0, 86400.0, "days"), (7200.0, 3600.0, "h"), (0.0, 1.0, "s"))
 
 
-def compared(c: Curve, caption: str, broad: bool) -> str:
-    """Return the figure of a measured output beside its simulations, their errors below."""
-    narrow = _compared(c, NARROW, 4.3)
-    return figure(_compared(c, BROAD, 4.3), caption, narrow) if broad else figure(narrow, caption)
-
-
-def _compared(c: Curve, width: float, height: float) -> Figure:
-    fig, (top, low) = sheet(width, height, 2, 1, sharex=True, height_ratios=(3, 2))
-    scale, word = next((s, w) for least, s, w in SCALES if np.ptp(c.t) >= least)
-    t = (c.t - c.t[0]) / scale
+def compared(c: Curve, caption: str) -> str:
+    """Return the figure of a measured output with its simulations, and of their errors."""
+    curves, errors = panel(), panel()
+    t, label = _times(c)
     dots = np.flatnonzero(np.isfinite(c.y))
     dots = dots[:: max(1, -(-len(dots) // DOTS))]
-    top.plot(
+    curves.plot(
         *_dots(t[dots], c.y[dots]),
         lw=3,
         color=GREY,
@@ -49,51 +41,44 @@ def _compared(c: Curve, width: float, height: float) -> Figure:
     )
     for k, e in c.errors.items():
         fit = c.fit_percent(k)
-        label = COLUMNS[k] if fit is None else f"{COLUMNS[k]}: {percent(fit)} %"
+        name = COLUMNS[k] if fit is None else f"{COLUMNS[k]}: {percent(fit)} %"
         style = {"lw": 0.9, "ls": "--"} if k == "before" else {"lw": 1.5}
-        top.plot(*_thin(t, c.y - e), color=SHADES[k], label=label, **style)
+        curves.plot(*_thin(t, c.y - e), color=SHADES[k], label=name, **style)
         if k != "before":
-            low.plot(*_thin(t, e), color=SHADES[k], lw=0.9)
+            errors.plot(*_thin(t, e), color=SHADES[k], lw=0.9)
     room = max(ROOM * float(np.ptp(c.y[dots])), 1e-12)
-    top.set_ylim(c.y[dots].min() - room, c.y[dots].max() + room)
-    low.axhline(0, color=FAINT, lw=0.8, zorder=0)
-    low.set_xlabel(f"time ({word})")
-    top.set_ylabel(_with_unit(c.output, unit(c.unit)))
-    low.set_ylabel(_with_unit("error", _difference(c.unit)))
-    fig.legend(
-        *top.get_legend_handles_labels(),
-        loc="outside upper left",
-        ncols=4 if width > NARROW else 2,
-        frameon=False,
-    )
-    return fig
+    curves.set_ylim(c.y[dots].min() - room, c.y[dots].max() + room)
+    titled(curves, "", label, _with_unit(c.output, unit(c.unit)))
+    titled(errors, "", label, _with_unit("error", _difference(c.unit)))
+    errors.set_xlim(curves.get_xlim())
+    return panels((curves, errors), caption)
 
 
 def remaining(c: Curve, key: str, noise: float, caption: str) -> str:
     """Return the figure of an error in its own scale, with its autocorrelation and cumulated periodogram."""
     e = c.errors[key]
     seen = e[np.isfinite(e)]
-    white = len(seen) >= FEWEST and float(np.ptp(seen)) > 0
-
-    def drawn(width: float, height: float, *panels: int) -> Figure:
-        """Return a figure of `panels` (rows, columns): the error, and if `white` its two tests."""
-        fig, axes = sheet(width, height, *panels)
-        _error(axes[0], c, e, noise)
-        if white:
-            draw_autocorrelation(axes[1], seen)
-            draw_periodogram(axes[2], seen)
-        return fig
-
-    if not white:
-        return figure(drawn(BROAD, 2.4), caption, drawn(NARROW, 2.2))
-    return figure(drawn(BROAD, 2.7, 1, 3), caption, drawn(NARROW, 6.6, 3, 1))
+    drawn = [_error(c, e, noise)]
+    if len(seen) >= FEWEST and float(np.ptp(seen)) > 0:
+        drawn += [panel(THIRD), panel(THIRD)]
+        draw_autocorrelation(drawn[1], seen)
+        draw_periodogram(drawn[2], seen)
+    return panels(drawn, caption)
 
 
-def _error(axes: Axes, c: Curve, e: np.ndarray, noise: float) -> None:
-    scale, word = next((s, w) for least, s, w in SCALES if np.ptp(c.t) >= least)
+def _error(c: Curve, e: np.ndarray, noise: float) -> Axes:
+    axes = panel(THIRD)
+    t, label = _times(c)
     axes.axhspan(-WIDE * noise, WIDE * noise, color=FAINT, lw=0, alpha=0.6)
-    axes.plot(*_thin((c.t - c.t[0]) / scale, e), color=BLUE, lw=0.7)
-    titled(axes, "error, and 95 % of the noise", f"time ({word})", _with_unit(c.output, _difference(c.unit)))
+    axes.plot(*_thin(t, e), color=BLUE, lw=0.7)
+    titled(axes, "error, and 95 % of the noise", label, _with_unit(c.output, _difference(c.unit)))
+    return axes
+
+
+def _times(c: Curve) -> tuple[np.ndarray, str]:
+    """Return the times (N,) since the begin in a unit that suits them, and the axis' label."""
+    scale, word = next((s, w) for least, s, w in SCALES if np.ptp(c.t) >= least)
+    return (c.t - c.t[0]) / scale, f"time ({word})"
 
 
 def _dots(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
