@@ -2,10 +2,11 @@
 
 python -m tests.bench.parts [--before CHECKOUT] CASE [CASE ...]
 
-Each case is diagnosed in a process of its own, on one core, with no compiled plant at hand, in both checkouts one after
-the other. Its stack is sampled every 5 ms of processor time. Each sample counts for the innermost stage that it is in;
-the compiler's processes are added. A row for each family (`family` of its answer.yaml, else the folder's name) and
-checkout: mean seconds of processor time of a case by stage, names that the verdict gives, and whether they are the same.
+Each case is diagnosed in a process of its own, on one core, with no compiled plant but with Python's bytecode at hand, in
+both checkouts one after the other. Its stack is sampled every 5 ms of processor time. Each sample counts for the
+innermost stage that it is in; the compiler's processes are added. A row for each family (`family` of its answer.yaml,
+else the folder's name) and checkout: mean seconds of processor time of a case by stage, names that the verdict gives,
+and whether they are the same.
 """
 
 from __future__ import annotations
@@ -93,8 +94,8 @@ def sampled(case: Path) -> dict[str, object]:
     return {"seconds": seconds, "told": " ".join([result["verdict"], *names]), "MiB": own.ru_maxrss / 1024}
 
 
-def measured(case: Path, checkout: Path) -> dict[str, object]:
-    """Diagnose a case in a process of its own, with the code of a checkout."""
+def measured(case: Path, checkout: Path, bytecode: str) -> dict[str, object]:
+    """Diagnose a case in a process of its own with a checkout's code, whose bytecode is in a folder."""
     python = checkout / ".venv/bin/python"
     call = [
         str(python if python.exists() else sys.executable),
@@ -108,6 +109,8 @@ def measured(case: Path, checkout: Path) -> dict[str, object]:
             "THERMOCTL_CACHE": cache,
             "PYTHONPATH": str(checkout),
             "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONDONTWRITEBYTECODE": "",
+            "PYTHONPYCACHEPREFIX": bytecode,
         }
         out = subprocess.run(call, capture_output=True, text=True, check=True, env=own, cwd=cache).stdout
     return dict(json.loads(out.splitlines()[-1]))
@@ -148,20 +151,23 @@ def main(argv: list[str]) -> int:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     checkouts = {**({"before": a.before.resolve()} if a.before else {}), "here": HERE}
     rows: dict[tuple[str, str], list[dict[str, float]]] = collections.defaultdict(list)
-    for case in a.cases:
-        told = {}
-        for which, checkout in checkouts.items():
-            found = measured(case.resolve(), checkout)
-            seconds: dict[str, float] = found["seconds"]  # type: ignore[assignment]
-            rows[family(case), which].append(seconds)
-            told[which] = found["told"]
-            print(
-                f"{case} {which}: {sum(seconds.values()):.1f} s, {found['MiB']:.0f} MiB, {found['told']}",
-                file=sys.stderr,
-                flush=True,
-            )
-        if len(set(told.values())) > 1:
-            print(f"{case}: another answer: {told['before']} -> {told['here']}", flush=True)
+    with tempfile.TemporaryDirectory() as bytecode:
+        for checkout in checkouts.values():  # not counted: this run writes the bytecode
+            measured(a.cases[0].resolve(), checkout, bytecode)
+        for case in a.cases:
+            told = {}
+            for which, checkout in checkouts.items():
+                found = measured(case.resolve(), checkout, bytecode)
+                seconds: dict[str, float] = found["seconds"]  # type: ignore[assignment]
+                rows[family(case), which].append(seconds)
+                told[which] = found["told"]
+                print(
+                    f"{case} {which}: {sum(seconds.values()):.1f} s, {found['MiB']:.0f} MiB, {found['told']}",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            if len(set(told.values())) > 1:
+                print(f"{case}: another answer: {told['before']} -> {told['here']}", flush=True)
     table(rows)
     return 0
 

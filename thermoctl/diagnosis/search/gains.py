@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import gammaincc
 
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
@@ -169,6 +168,8 @@ def _plausible(
 
     The other amplitudes are products with the first one. If the plant's parameters absorb the first one, the
     data do not determine its size and sign. Then the prior of the other amplitudes determines them."""
+    from scipy.optimize import minimize_scalar  # slow to load, and only an entry with a prior needs it
+
     shape, _ = columns[0].item[2]
     dims = np.array([q.item[2][1] for q in columns])  # (columns, amplitudes)
     step = covariance @ dims[:, 0]
