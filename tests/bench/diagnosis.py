@@ -37,7 +37,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed, as_refitted, fitted
 from thermoctl.diagnosis.evidence.held_out import worth
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction, parameter_values
@@ -187,7 +187,7 @@ def sindy(job: Job) -> dict[str, Any]:
     for _, c, kept in sorted(chosen.values(), key=lambda item: -item[0])[:MOST]:
         start = {k[1:]: v for k, v in kept.items() if k.startswith("=")}
         direction = Direction(
-            dataclasses.replace(c, rig=Structure(current.plant, drives, rig.columns)),
+            dataclasses.replace(c, rig=Rig(current.plant, drives, rig.columns)),
             {k: v for k, v in kept.items() if k and not k.startswith("=")},
             0.0,
             1,

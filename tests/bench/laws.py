@@ -27,7 +27,7 @@ from tests.laws.prove import AMBIENT, EQUAL, PART, cases, judge, without
 from tests.laws.rigs import Made, make
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, fitted
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.signals import Place, Signal, signals
 from thermoctl.diagnosis.law.smooth import LATENT, tracked
 from thermoctl.diagnosis.limits import limits
@@ -93,7 +93,7 @@ def smoothed(plant: Plant, tables: Sequence[Table], nodes: Sequence[str]) -> tup
     known = case(plant, tables, {}, Budget(limits().fits))
     first = as_refitted(known, fitted(known, known.plant, (), known.null))
     at = tracked(known, first, list(nodes))
-    rig = Structure(first.rough_plant, known.drives(first.rough.model), [t.columns for t in known.tables])
+    rig = Rig(first.rough_plant, known.drives(first.rough.model), [t.columns for t in known.tables])
     flows = {}
     for node in nodes:
         found = signals(rig, Place(node), at.runs)

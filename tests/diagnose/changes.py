@@ -22,7 +22,7 @@ Columns = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Rig:
+class Given:
     """A plant file's content and its recordings, by name; `back`: changed names and what they were."""
 
     plant: dict[str, Any]
@@ -41,11 +41,11 @@ class Rig:
         return [o.get("column", name) for name, o in self.plant["outputs"].items()]
 
 
-def _map(rig: Rig, change: Callable[[Columns], Columns]) -> Rig:
-    return Rig(rig.plant, {k: change(c) for k, c in rig.recordings.items()}, rig.back)
+def _map(rig: Given, change: Callable[[Columns], Columns]) -> Given:
+    return Given(rig.plant, {k: change(c) for k, c in rig.recordings.items()}, rig.back)
 
 
-def names(rig: Rig) -> Rig:
+def names(rig: Given) -> Given:
     """Replace every name, of columns too, by one that says nothing."""
     old = sorted({n for s in SECTIONS for n in rig.plant.get(s, {})})
     columns = sorted({c for r in rig.recordings.values() for c in r} - set(old) - {"t"})
@@ -64,10 +64,10 @@ def names(rig: Rig) -> Rig:
     for s in SECTIONS:
         plant[s] = {new[n]: renamed(v) for n, v in rig.plant.get(s, {}).items()}
     recordings = {k: {new.get(c, c): v for c, v in r.items()} for k, r in rig.recordings.items()}
-    return Rig(plant, recordings, {v: k for k, v in new.items()})
+    return Given(plant, recordings, {v: k for k, v in new.items()})
 
 
-def order(rig: Rig) -> Rig:
+def order(rig: Given) -> Given:
     """Reverse keys, columns and recordings."""
     plant = {
         k: dict(reversed(v.items())) if isinstance(v, dict) else v for k, v in reversed(rig.plant.items())
@@ -76,15 +76,15 @@ def order(rig: Rig) -> Rig:
         k: {"t": c["t"], **{n: c[n] for n in reversed(c) if n != "t"}}
         for k, c in reversed(rig.recordings.items())
     }
-    return Rig(plant, recordings)
+    return Given(plant, recordings)
 
 
-def clock(rig: Rig) -> Rig:
+def clock(rig: Given) -> Given:
     """Count seconds from 1970."""
     return _map(rig, lambda c: {**c, "t": c["t"] + EPOCH})
 
 
-def kelvin(rig: Rig) -> Rig | None:
+def kelvin(rig: Given) -> Given | None:
     """Give every temperature in kelvin."""
     plant = copy.deepcopy(rig.plant)
     warm = {n for s in ("inputs", "nodes") for n, x in plant.get(s, {}).items() if x.get("unit") == "degC"}
@@ -124,11 +124,11 @@ def kelvin(rig: Rig) -> Rig | None:
             if "range" in p:
                 p["range"] = [v + 273.15 for v in p["range"]]
     return _map(
-        Rig(plant, rig.recordings), lambda c: {k: v + 273.15 if k in shifted else v for k, v in c.items()}
+        Given(plant, rig.recordings), lambda c: {k: v + 273.15 if k in shifted else v for k, v in c.items()}
     )
 
 
-def milliwatt(rig: Rig) -> Rig | None:
+def milliwatt(rig: Given) -> Given | None:
     """Give power in mW, and with it energy and conductance."""
     plant = copy.deepcopy(rig.plant)
     if not any(f.get("unit") == "W" for f in plant.get("flows", {}).values()):
@@ -151,11 +151,11 @@ def milliwatt(rig: Rig) -> Rig | None:
             if not scaled & set(re.findall(r"[A-Za-z_]\w*", f["rate"])):
                 f["rate"] = f"1000 * ({f['rate']})"
     return _map(
-        Rig(plant, rig.recordings), lambda c: {k: 1000 * v if k in columns else v for k, v in c.items()}
+        Given(plant, rig.recordings), lambda c: {k: 1000 * v if k in columns else v for k, v in c.items()}
     )
 
 
-def _steady(rig: Rig, c: Columns) -> np.ndarray:
+def _steady(rig: Given, c: Columns) -> np.ndarray:
     """Rows (N,) at which no held input is another than before."""
     same = np.ones(len(c["t"]), bool)
     for name, linear in rig.inputs().items():
@@ -165,7 +165,7 @@ def _steady(rig: Rig, c: Columns) -> np.ndarray:
     return same
 
 
-def cells_lost(rig: Rig) -> Rig:
+def cells_lost(rig: Given) -> Given:
     """Lose LOST of the cells; those of held inputs where they stay."""
     random = np.random.default_rng(SEED)
 
@@ -182,7 +182,7 @@ def cells_lost(rig: Rig) -> Rig:
     return _map(rig, change)
 
 
-def rows_lost(rig: Rig) -> Rig:
+def rows_lost(rig: Given) -> Given:
     """Lose LOST of the rows, where no held input changes."""
     random = np.random.default_rng(SEED)
 
@@ -193,7 +193,7 @@ def rows_lost(rig: Rig) -> Rig:
     return _map(rig, change)
 
 
-def columns_added(rig: Rig) -> Rig:
+def columns_added(rig: Given) -> Given:
     """Add columns that have nothing to do with the rig."""
     random = np.random.default_rng(SEED)
 
@@ -211,7 +211,7 @@ def columns_added(rig: Rig) -> Rig:
     return _map(rig, change)
 
 
-def thinned(rig: Rig, kernel: np.ndarray = KERNEL) -> Rig:
+def thinned(rig: Given, kernel: np.ndarray = KERNEL) -> Given:
     """Keep every second row, after a low-pass filter that neither delays nor passes half the sampling rate.
 
     A held input is its mean until the next kept row; readings beside its jumps would mix both, and are left out."""
@@ -236,19 +236,19 @@ def _smooth(v: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     return np.concatenate([v[:1], np.convolve(v, kernel, "valid"), v[-1:]])
 
 
-def noise_stated(factor: float) -> Callable[[Rig], Rig]:
+def noise_stated(factor: float) -> Callable[[Given], Given]:
     """State the sensors' noise wrongly by a factor."""
 
-    def change(rig: Rig) -> Rig:
+    def change(rig: Given) -> Given:
         plant = copy.deepcopy(rig.plant)
         for o in plant["outputs"].values():
             o["noise"] *= factor
-        return Rig(plant, rig.recordings)
+        return Given(plant, rig.recordings)
 
     return change
 
 
-def one_of_unknown_start(rig: Rig) -> Rig:
+def one_of_unknown_start(rig: Given) -> Given:
     """Keep the first recording, with starts that may be anywhere: those of a recording that begins in its middle."""
     plant = copy.deepcopy(rig.plant)
     (first, c), *_ = rig.recordings.items()
@@ -269,20 +269,20 @@ def one_of_unknown_start(rig: Rig) -> Rig:
         str(v) for s in ("nodes", "flows", "outputs") for x in plant[s].values() for v in x.values()
     )
     plant["inputs"] = {n: x for n, x in plant["inputs"].items() if re.search(rf"\b{n}\b", read)}
-    return Rig(plant, {first: c})
+    return Given(plant, {first: c})
 
 
-def cut(rig: Rig) -> Rig:
+def cut(rig: Given) -> Given:
     """Cut each recording in two."""
     halves = {}
     for name, c in rig.recordings.items():
         middle = len(c["t"]) // 2
         halves[f"{name}_a"] = {k: v[:middle] for k, v in c.items()}
         halves[f"{name}_b"] = {k: v[middle:] for k, v in c.items()}
-    return Rig(rig.plant, halves)
+    return Given(rig.plant, halves)
 
 
-Change = Callable[[Rig], Rig | None]
+Change = Callable[[Given], Given | None]
 # by name: what both sides have in common, and the change
 CHANGES: dict[str, tuple[Change | None, Change]] = {
     "names": (None, names),
@@ -300,14 +300,14 @@ CHANGES: dict[str, tuple[Change | None, Change]] = {
 }
 
 
-def together(*changes: Change) -> Callable[[Rig], Rig]:
+def together(*changes: Change) -> Callable[[Given], Given]:
     """Several changes, one after the other."""
 
-    def change(rig: Rig) -> Rig:
+    def change(rig: Given) -> Given:
         for c in changes:
             changed = c(rig)
             assert changed is not None
-            rig = Rig(changed.plant, changed.recordings, changed.back or rig.back)
+            rig = Given(changed.plant, changed.recordings, changed.back or rig.back)
         return rig
 
     return change

@@ -22,7 +22,7 @@ import numpy as np
 import yaml
 
 from tests.concealed.generate import NotVisible, make_case
-from tests.diagnose.changes import CHANGES, PLAIN, SEED, Change, Rig, thinned
+from tests.diagnose.changes import CHANGES, PLAIN, SEED, Change, Given, thinned
 from thermoctl.diagnosis.run import diagnose_files
 
 CLOSE = 0.02  # probabilities that differ by less are the same (issue 23)
@@ -51,17 +51,17 @@ CASES = (  # family, number, kind, world; the quick ones first
 )
 
 
-def drawn(family: str, number: int, kind: str, world: str) -> tuple[Rig, dict[str, Any]]:
+def drawn(family: str, number: int, kind: str, world: str) -> tuple[Given, dict[str, Any]]:
     """A case of the generator, thinned TIMES, and its answer."""
     plant, runs, answer = make_case(SEED, number, [family], True, kind, world)
     plain = yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(plant, default=float))))
-    rig = Rig(plain, {f"run_{k + 1}": dict(run) for k, run in enumerate(runs)})
+    rig = Given(plain, {f"run_{k + 1}": dict(run) for k, run in enumerate(runs)})
     for _ in range(TIMES[family]):
         rig = thinned(rig, PLAIN)
     return rig, answer
 
 
-def diagnosed(rig: Rig, folder: Path) -> dict[str, Any]:
+def diagnosed(rig: Given, folder: Path) -> dict[str, Any]:
     """The diagnosis of a case by its files."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "plant.yaml").write_text(yaml.safe_dump(rig.plant, sort_keys=False))
@@ -95,7 +95,7 @@ def difference(one: Mapping[str, Any], other: Mapping[str, Any], back: Mapping[s
     return "; ".join(said)
 
 
-def compared(rig: Rig, changes: Sequence[str], work: Path) -> dict[str, str]:
+def compared(rig: Given, changes: Sequence[str], work: Path) -> dict[str, str]:
     """The verdict without a change, and what differs after each change."""
     before: dict[Change | None, dict[str, Any]] = {None: diagnosed(rig, work / "base_0")}
     out = {"": before[None]["verdict"]}

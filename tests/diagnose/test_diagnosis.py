@@ -15,7 +15,6 @@ from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.result import doubts
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads
@@ -326,7 +325,7 @@ def test_hysteresis_pressed_to_its_least_width_is_no_finding(least, absent):
     table.columns["encoder"] = table.columns["encoder"] + rng.normal(0, 5e-6, len(t))
     known = catalogue((CATALOGUE,))
     c = case(loads(FREE_CARRIAGE), [table], known, Budget(1))
-    rig = Structure(c.plant, c.drives(c.null.model), [t.columns for t in c.tables])
+    rig = Rig(c.plant, c.drives(c.null.model), [t.columns for t in c.tables])
     entry = next(x for x in candidates(rig, known) if x.key == ("backlash_hysteresis", "velocity"))
     start = {"F": 3.0, "X0": 3 * least}
     plant = entry.extend(start, {"F": (0.1, 30.0), "X0": (least, 0.1)})

@@ -13,7 +13,7 @@ from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant import loads
@@ -72,13 +72,13 @@ def _recording(
     )
 
 
-def _candidate(rig: Structure, effect: str) -> Candidate:
+def _candidate(rig: Rig, effect: str) -> Candidate:
     return next(c for c in candidates(rig, catalogue()) if c.effect.name == effect)
 
 
 def _extended(plant, table: Table, effect: str, values: dict[str, float]):
     drive = compile_plant(plant).excitation(table)
-    rig = Structure(plant, [drive], [table.columns])
+    rig = Rig(plant, [drive], [table.columns])
     c = _candidate(rig, effect)
     shape = {p.shape: values[p.name] for p in c.effect.parameters if p.shape}
     return extend(plant, Direction(c, shape, 100.0, 1, values), [drive]), c

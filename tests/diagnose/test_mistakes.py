@@ -9,7 +9,7 @@ from thermoctl.checks import checks
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.mistakes import MISTAKES
@@ -28,7 +28,7 @@ def fixed(plant, name, factor=1.0):
 
 def places(plant):
     drives = [compile_plant(plant).excitation(rig(BLOCK)[1])]
-    found = candidates(Structure(plant, drives, [rig(BLOCK)[1].columns]), catalogue((MISTAKES,)))
+    found = candidates(Rig(plant, drives, [rig(BLOCK)[1].columns]), catalogue((MISTAKES,)))
     return {c.key for c in found if c.effect.where != "sensor"}
 
 

@@ -13,7 +13,7 @@ from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.evidence.onsets import moved
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -37,7 +37,7 @@ def known(tmp_path):
 
 def placed(known, at):
     """The plant with an offset step at a time, and the effect."""
-    rig = Structure(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = Rig(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
     entry = catalogue((CATALOGUE,))["sensor_offset_step"]
     c = next(iter(candidates(rig, {entry.name: entry})))
     plant = c.extend({"A": 0.5, "T0": at}, {"A": (-10.0, 10.0), "T0": (0.0, N - 1.0)})

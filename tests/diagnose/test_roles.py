@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.diagnose.changes import Rig, kelvin, milliwatt, names, order
+from tests.diagnose.changes import Given, kelvin, milliwatt, names, order
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
@@ -69,7 +69,7 @@ outputs:
 """
 
 
-def blocks() -> Rig:
+def blocks() -> Given:
     """Two heated blocks and a rod, with a column that nothing reads."""
     t = np.arange(0.0, 600.0, 10.0)
     columns = {
@@ -82,18 +82,18 @@ def blocks() -> Rig:
         "wall": 23 + np.cos(t / 200),
         "oil": 30 + 5 * np.sin(t / 100),
     }
-    return Rig(yaml.safe_load(BLOCKS), {"run": columns})
+    return Given(yaml.safe_load(BLOCKS), {"run": columns})
 
 
-def _read(rig: Rig) -> tuple[Plant, Structure, Table]:
+def _read(rig: Given) -> tuple[Plant, Rig, Table]:
     plant = from_plain(rig.plant)
     columns = dict(rig.recordings["run"])
     table = Table("run", "run", columns.pop("t"), columns)
     drive = compile_plant(plant).excitation(table)
-    return plant, Structure(plant, [drive], [columns]), table
+    return plant, Rig(plant, [drive], [columns]), table
 
 
-def _places(rig: Rig) -> set[tuple[str, str, int, tuple[str, ...]]]:
+def _places(rig: Given) -> set[tuple[str, str, int, tuple[str, ...]]]:
     _, structure, _ = _read(rig)
     return {
         (
@@ -113,7 +113,7 @@ def test_every_effect_has_the_same_places_whatever_the_names_and_units(other):
 
 
 def test_the_order_of_keys_decides_nothing_but_the_order_of_pairs():
-    def unordered(rig: Rig) -> set:
+    def unordered(rig: Given) -> set:
         return {(e, frozenset(w.split("-")), v, s) for e, w, v, s in _places(rig)}
 
     assert unordered(order(blocks())) == unordered(blocks())
@@ -135,7 +135,7 @@ def _values(c: Candidate) -> dict[str, float]:
     return {p.name: special.get(p.name, 0.02 + p.null) for p in c.effect.parameters}
 
 
-def _changes(rig: Rig) -> dict[tuple, tuple[dict, dict]]:
+def _changes(rig: Given) -> dict[tuple, tuple[dict, dict]]:
     """What each effect at each place changes along the plant's own trajectory: slopes and readings."""
     plant, structure, table = _read(rig)
     model = compile_plant(plant)
@@ -176,7 +176,7 @@ def test_an_effect_of_heat_has_the_unit_of_the_plants_heat_flows():
 def test_a_rate_and_its_integral_are_a_motion_in_any_unit():
     plain = yaml.safe_load(OSCILLATOR)
     for change in (lambda p: p, lambda p: p["flows"]["rate"].update(rate="1000 * slope") or p):
-        rig = Structure(from_plain(change(plain)), [], [])
+        rig = Rig(from_plain(change(plain)), [], [])
         assert (rig.velocities, rig.position_of) == (["slope"], {"slope": "out"})
         assert any(c.key == ("cubic_stiffness", "slope") for c in candidates(rig, catalogue()))
         assert any("'slope' is its rate" in note for note in rig.guesses())
@@ -188,21 +188,21 @@ def test_a_rate_and_its_integral_are_a_motion_in_any_unit():
 def test_what_is_not_the_plain_rate_is_no_motion(rate):
     plain = yaml.safe_load(OSCILLATOR)
     plain["flows"]["rate"]["rate"] = rate
-    assert not Structure(from_plain(plain), [], []).velocities
+    assert not Rig(from_plain(plain), [], []).velocities
 
 
 def test_a_role_stands_above_unit_and_structure():
     plain = yaml.safe_load(BLOCKS)
     plain["inputs"]["wall"]["role"] = "ambient"
-    assert Structure(from_plain(plain), [], []).air == "wall"
+    assert Rig(from_plain(plain), [], []).air == "wall"
     del plain["inputs"]["speed"]["unit"]
     plain["inputs"]["speed"]["role"] = "velocity"
     plain["inputs"]["stroke"]["role"] = "setpoint"
-    rig = Structure(from_plain(plain), [], [])
+    rig = Rig(from_plain(plain), [], [])
     assert (rig.signals("v"), rig.signals("x")) == (["speed"], [])
     tank = yaml.safe_load(OSCILLATOR)
     tank["nodes"]["out"]["role"] = "level"
-    assert not Structure(from_plain(tank), [], []).velocities
+    assert not Rig(from_plain(tank), [], []).velocities
 
 
 def test_an_input_with_a_role_that_nothing_reads_serves_effects_and_has_no_faults():
@@ -227,7 +227,7 @@ def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     plant = loads(OSCILLATOR)
     columns = {n: np.arange(5.0) for n in ("drive", "motor_speed", "position", "current", "x", "v", "c7")}
     drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
-    structure = Structure(plant, [drive], [columns])
+    structure = Rig(plant, [drive], [columns])
     assert structure.signals("v") == ["slope"], "the plant's own motion comes first"
     assert structure.signals("x") == ["out"]
     assert structure.signals("i") == ["current"]

@@ -24,7 +24,6 @@ from thermoctl.diagnosis.experiment.propose import propose, survivors
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.law.forms import Term, families, library
 from thermoctl.diagnosis.law.propose import PROPOSALS
 from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
@@ -107,7 +106,7 @@ def test_a_law_keeps_its_prior_odds_beside_effects(found):
     """It had the odds of an entry of the catalogue there, so that any effect beside a law gained some ten nats."""
     _, d, law = found
     known, leader = d.case, d.searched.tried[0]
-    rig = Structure(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = Rig(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
     other = Placed(candidates(rig, catalogue())[0], {})
     places = {other.key[0]: {other.key[1]}}
     alone, beside = (odds((*effects, other), places, limits()) for effects in ((), (law.placed,)))
@@ -154,7 +153,7 @@ def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
     known = d.case
     broth = made.plant.nodes["broth"]
     plant = replace(made.plant, nodes={**made.plant.nodes, "shell": replace(broth, name="shell")})
-    rig = Structure(plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = Rig(plant, known.drives(known.null.model), [t.columns for t in known.tables])
     c = law_candidate(rig, replace(law.proposal, place=Place("shell", None, part)))
     assert c.place.nodes == {"target": "shell"} and "shell" not in known.plant.nodes
 
@@ -267,7 +266,7 @@ def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
         tables.append(truth.measure(Table(f"run_{k}", "", t, columns), k))
     _, law = look(SimpleNamespace(plant=plant, tables=tables))
     assert [(t.form.name, t.variables) for t in law.proposal.terms] == [("daily", {"clock"})]
-    rig = Structure(plant, [truth.excitation(t) for t in tables], [t.columns for t in tables])
+    rig = Rig(plant, [truth.excitation(t) for t in tables], [t.columns for t in tables])
     assert not any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 800)]))
     assert any(s.daily for s in signals(rig, Place("one"), [_named(tables[0], 900)]))
 

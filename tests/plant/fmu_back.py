@@ -16,7 +16,7 @@ from tests.export.plants import plants, recording
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
@@ -51,7 +51,7 @@ def case(name: str) -> tuple[Plant, list[Table]]:
     effect, place, values = HIDDEN[name]
     tables = [dataclasses.replace(recording(plant, seed, dt=dt), name=f"run_{seed}") for seed in (1, 2)]
     model = compile_plant(plant)
-    rig = Structure(plant, [model.excitation(t) for t in tables], [t.columns for t in tables])
+    rig = Rig(plant, [model.excitation(t) for t in tables], [t.columns for t in tables])
     found = next(c for c in candidates(rig, catalogue()) if c.key == (effect, place))
     truth = compile_plant(found.extend(values), ())
     return plant, [truth.measure(t, seed) for seed, t in enumerate(tables)]

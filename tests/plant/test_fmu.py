@@ -13,7 +13,7 @@ from tests.plant.fmu_back import as_fmu
 from thermoctl import cli
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.export.commands import write
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load, save
@@ -136,13 +136,13 @@ def test_effects_at_inputs_outputs_and_states_but_not_inside(heater):
     plant, back, table = heater
     keys = []
     for p in (plant, back):
-        rig = Structure(p, [compile_plant(p).excitation(table)], [table.columns])
+        rig = Rig(p, [compile_plant(p).excitation(table)], [table.columns])
         keys.append({c.key for c in candidates(rig, catalogue())})
     assert {e for e, _ in keys[0] - keys[1]} <= {
         "conductance_step", "heat_split", "temperature_dependent_conductance", "overflow",
     }  # fmt: skip
     assert keys[1] - keys[0] == {("missing_link", "one-two")}  # the description does not tell of the link
-    rig = Structure(back, [compile_plant(back).excitation(table)], [table.columns])
+    rig = Rig(back, [compile_plant(back).excitation(table)], [table.columns])
     found = next(c for c in candidates(rig, catalogue()) if c.key == ("external_heat_source", "two"))
     longer = found.extend({"Q": 0.3, "T0": 500.0, "T1": 900.0})
     assert "two" in str(longer.flows["change_of_two"].rate)

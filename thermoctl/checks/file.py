@@ -35,8 +35,7 @@ def _values(plant: Plant, seed: int = 0) -> dict[str, float]:
 
 
 def _value(e: Expr, values: Mapping[str, float]) -> float:
-    plain = ex.substitute(e, lambda part: part.args[0] if part.op == "delay" else None)
-    return float(ex.evaluate(plain, values))
+    return float(ex.evaluate(ex.undelayed(e), values))
 
 
 def _storages(plant: Plant) -> list[Finding]:

@@ -62,8 +62,7 @@ def start_values(model: Model, excitation: Excitation) -> dict[str, float]:
 
 
 def _value(e: ex.Expr, values: dict[str, float]) -> float:
-    undelayed = ex.substitute(e, lambda part: part.args[0] if part.op == "delay" else None)
-    return float(ex.evaluate(undelayed, values))
+    return float(ex.evaluate(ex.undelayed(e), values))
 
 
 def _storages(model: Model, excitation: Excitation) -> list[Finding]:

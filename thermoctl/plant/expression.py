@@ -433,6 +433,16 @@ def substitute(expr: Expr, change: Callable[[Expr], Expr | None]) -> Expr:
     return done[id(expr)]
 
 
+def fill(expr: Expr, symbols: Mapping[str, Expr]) -> Expr:
+    """Return a copy with each name that is a key of `symbols` replaced by its expression."""
+    return substitute(expr, lambda e: symbols.get(e.value) if e.op == "name" else None)
+
+
+def undelayed(expr: Expr) -> Expr:
+    """Return a copy with each delayed signal replaced by the signal itself."""
+    return substitute(expr, lambda e: e.args[0] if e.op == "delay" else None)
+
+
 def _rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
     simple = {"+": add, "*": mul, "/": div, "**": power}
     if node.op in simple:

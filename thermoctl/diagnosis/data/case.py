@@ -18,7 +18,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back
@@ -193,7 +193,7 @@ def case(
     tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     coordinates = Coordinates(drives)
-    rig = Structure(plant, drives, [t.columns for t in tables])
+    rig = Rig(plant, drives, [t.columns for t in tables])
     return Case(
         plant,
         tuple(tables),

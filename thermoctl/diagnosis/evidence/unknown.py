@@ -11,7 +11,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.levels import levels, over_noise
 from thermoctl.diagnosis.evidence.where import Responses, responses, signals
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 
 CORRELATED, SHOWN = 0.4, 3  # reported signals: least correlation with the residual; largest number
 
@@ -46,7 +46,7 @@ def left(case: Case, f: Fitted, reach: Responses) -> Left:
 def reached(case: Case) -> Responses:
     """Return how random forces at the nodes of the refitted original plant change its outputs."""
     model = case.null.model
-    rates = set(Structure(case.plant, [], []).pairs.values())  # positions store nothing
+    rates = set(Rig(case.plant, [], []).pairs.values())  # positions store nothing
     return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
 
 

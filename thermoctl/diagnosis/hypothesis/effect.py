@@ -136,16 +136,14 @@ class Effect:
             return self
         if not all(p.low <= exponent <= p.high for p in own):
             return None
-
-        def with_null(p: EffectParameter) -> EffectParameter:
-            """Return the parameter with the outlet's exponent as its null value."""
-            if p.origin != "exponent" or p.trial is None:
-                return p
-            values = {"exponent": ex.num(exponent)}
-            trial = ex.substitute(p.trial, lambda e: values.get(str(e.value)) if e.op == "name" else None)
-            return dataclasses.replace(p, null=exponent, trial=trial)
-
-        return dataclasses.replace(self, parameters=tuple(map(with_null, self.parameters)))
+        here = {"exponent": ex.num(exponent)}
+        parameters = tuple(
+            dataclasses.replace(p, null=exponent, trial=ex.fill(p.trial, here))
+            if p.origin == "exponent" and p.trial
+            else p
+            for p in self.parameters
+        )
+        return dataclasses.replace(self, parameters=parameters)
 
     @property
     def timed(self) -> bool:

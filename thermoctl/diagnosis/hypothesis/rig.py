@@ -1,4 +1,9 @@
-"""Kinds of signals, moving inputs and ambient of a plant and its recordings, for placing effects."""
+"""A plant and its recordings: kinds of quantities, moving inputs and ambient, for placing effects.
+
+Kinds follow from `role`, units and structure of the plant, never from its names. Only a column that the plant
+does not read has none of these: then its name gives a guess. If one node is the rate of another, the two are
+a velocity and its position, in any unit. The ambient is the reference temperature of heat losses. Each
+assumption is a note in the result."""
 
 from __future__ import annotations
 
@@ -22,7 +27,14 @@ STRAIGHT = "_straight"  # suffix of the linearly interpolated copy of a held inp
 KELVIN = {"K", "kelvin"}
 ZERO_DEGC = 273.15  # K
 TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
-
+MOVING = ("velocity", "rotation")
+# Kinds by unit of a node that structure makes a velocity, and of its position.
+RATES, PLACES = ("", *MOVING, "voltage"), ("", "length", "voltage")
+JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
+# Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
+# has a note about each guess.
+SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"current|^i$", "T": r"temp|_c$|^t_"}
+MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
 
 _KINDS = {
     "temperature": "K",
@@ -35,6 +47,11 @@ _KINDS = {
     "power": "W",
     "volume": "m^3",
 }
+_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # every other role is also the name of a kind
+# Nodes that an effect added to model a reading (lag, memory of the initial state) are no places.
+_READINGS = re.compile(
+    r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
+)
 
 
 @cache
@@ -56,87 +73,104 @@ def zero_of(unit: str | None) -> float:
     return ZERO_DEGC if unit in KELVIN else 0.0
 
 
-_ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # every other role is also the name of a kind
+def _stated(q: Input | Node | Output) -> str:
+    """Return the kind of a quantity by its role, or else by its unit; "" where neither states it."""
+    return _ROLE_KINDS.get(q.role, q.role) if q.role else kind_of(q.unit)
 
 
-# Nodes that an effect added to model a reading (lag, memory of the initial state) are no places.
-_READINGS = re.compile(
-    r"(lagged|memory|grown)_(sensor_lag|cold_junction_drift|missing_member|expansion_lag)_"
-)
-
-
-# Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
-# has a note about each guess.
-SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"current|^i$", "T": r"temp|_c$|^t_"}
-MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
-
-
-JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
+def _motions(plant: Plant) -> dict[str, str]:
+    """Return velocity nodes and their position nodes: the integral of a multiple of the velocity."""
+    values = {p.name: p.value for p in plant.parameters.values()}
+    positions = {}
+    for x in plant.nodes.values():
+        flows = [f for f in plant.flows.values() if x.name in (f.source, f.target)]
+        if len(flows) != 1 or flows[0].target != x.name or flows[0].source is not None:
+            continue
+        rate, read = flows[0].rate, ex.names(flows[0].rate) - values.keys()
+        if any(e.op == "delay" for e in ex.walk(rate)):
+            continue  # not the present velocity
+        for v in plant.nodes.keys() & read - {x.name}:
+            driven = any(v in (f.source, f.target) for f in plant.flows.values())
+            constant = ex.names(x.storage) | ex.names(ex.derivative(rate, v)) <= values.keys()
+            if read == {v} and driven and constant and ex.evaluate(rate, {**values, v: 0.0}) == 0:
+                positions[v] = x.name
+    return {
+        v: x
+        for v, x in positions.items()
+        if _stated(plant.nodes[v]) in RATES and _stated(plant.nodes[x]) in PLACES
+    }
 
 
 class Rig:
-    """A plant and its recordings: kinds of nodes, moving inputs, ambient, by roles and units."""
+    """A plant and its recordings, with the kinds of its quantities.
+
+    - `physics`: the plant without the parts that an observer and effects of readings added
+    - `pairs`: by velocity, its position, where the structure of the plant shows it; `position_of`: these, and
+      the pairs that units show
+    - `temperatures`, `velocities`: nodes; `heat_inputs`: inputs that are temperatures
+    - `moving_inputs`: those that change; `spare`: recorded columns that the plant does not read
+    - `air`: the ambient; `duration`, `sample`: of the longest recording, and its shortest interval, s"""
 
     def __init__(
         self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
     ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         self._jumps: dict[str, float] = {}  # by column
-        p = dataclasses.replace(
+        self.physics = p = dataclasses.replace(
             plant,
             inputs={
                 k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT) and not k.startswith(SEEN)
             },
             flows={k: v for k, v in plant.flows.items() if not k.startswith(CORRECT)},
         )
-        self.physics = p
+        self.pairs = _motions(plant)
         self.temperatures = [
             n.name for n in p.nodes.values() if self.kind(n) == "temperature" and not _READINGS.match(n.name)
         ]
-        self.velocities = [
-            n.name
-            for n in p.nodes.values()
-            if self.kind(n) in ("velocity", "rotation")
-            and any(f.target == n.name or f.source == n.name for f in p.flows.values())
-        ]
+        driven = {end for f in p.flows.values() for end in (f.source, f.target)}
+        moving = [n.name for n in p.nodes.values() if self.kind(n) in MOVING and n.name in driven]
         self.position_of: dict[str, str] = {}
         for f in p.flows.values():
-            for v in self.velocities:
+            for v in moving:
                 if f.target and f.target != v and ex.names(f.rate) == {v}:
                     self.position_of.setdefault(v, f.target)
-        long = [d.t for d in drives if len(d.t) > 1]
-        self.duration = max((float(d.t[-1]) for d in drives), default=1.0)  # s, of the longest recording
-        self.sample = min(
-            (float(np.median(np.diff(t))) for t in long), default=1.0
-        )  # s, the shortest interval
-        common = set.intersection(*(set(c) for c in columns)) if columns else set()
-        taken = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
-        self.spare = sorted(
-            c
-            for c in common - taken
-            if re.fullmatch(r"[A-Za-z_]\w*", c)
-            and c not in p.nodes
-            and c not in p.parameters
-            and c not in p.outputs
-            and c not in p.inputs
-            and c not in p.flows
-            and all(np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in columns if np.isfinite(t[c]).any())
-            and all(np.isfinite(t[c]).any() for t in columns)
-        )
-        moving = {
+        self.position_of |= self.pairs
+        self.velocities = list(dict.fromkeys([*moving, *self.pairs]))
+        intervals = [float(np.median(np.diff(d.t))) for d in drives if len(d.t) > 1]
+        self.duration = max((float(d.t[-1]) for d in drives), default=1.0)
+        self.sample = min(intervals, default=1.0)
+        self.spare = sorted(c for c in self._unread() if re.fullmatch(r"[A-Za-z_]\w*", c))
+        self.moving_inputs = {
             i
             for j, i in enumerate(plant.inputs)
             if i in p.inputs and any(np.ptp(d.u[:, j]) > 0 for d in drives)
         }
-        self.moving_inputs = moving
         self.heat_inputs = [i for i in p.inputs if self.kind(p.inputs[i]) == "temperature"]
-        named = [
-            i
-            for i in self.heat_inputs
-            if re.search(r"air|amb|room|outdoor|chamber|base|environment", i, re.I)
-            and not re.search(r"start|initial", i, re.I)
+        count = self._ambients()
+        # the reference of most losses of heat; among equals the coolest
+        self.air = min(count, key=lambda i: (-count[i], self._mean(i)), default=None)
+
+    def _unread(self) -> list[str]:
+        """Return the columns that move in every recording and are no part of the plant."""
+        p = self.physics
+        common = set.intersection(*(set(c) for c in self.columns)) if self.columns else set()
+        read = {q.column for table in (p.inputs, p.outputs) for q in table.values()}
+        known = {*p.nodes, *p.parameters, *p.outputs, *p.inputs, *p.flows}
+        return [
+            c
+            for c in common - read - known
+            if all(np.isfinite(t[c]).any() and np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in self.columns)
         ]
-        self.air = next(iter(named), None) or self._coolest()
+
+    def kind(self, q: Input | Node | Output) -> str:
+        """Return the kind of a quantity: from its role, its motion, the node that it reads, or its unit."""
+        read = str(q.value.value) if isinstance(q, Output) and q.value.op == "name" else q.name
+        if q.role is None and not isinstance(q, Input):
+            if read in self.pairs.values():
+                return "length"
+            if read in self.pairs:
+                return "velocity"
+        return _stated(q)
 
     def largest_jump(self, reading: Input | Output) -> float:
         """Return the largest change of a reading within JUMP samples, over all recordings."""
@@ -147,18 +181,30 @@ class Rig:
             self._jumps[reading.column] = max((float(d.max(initial=0.0)) for d in changes), default=np.inf)
         return self._jumps[reading.column]
 
-    def kind(self, q: Input | Node | Output) -> str:
-        """Return the kind of a quantity, from its role or else its unit; "" where neither states it."""
-        return _ROLE_KINDS.get(q.role, q.role) if q.role else kind_of(q.unit)
+    def _ambients(self) -> dict[str, int]:
+        """Return the reference temperatures of heat losses: name -> number of losses."""
+        stated = [i.name for i in self.physics.inputs.values() if i.role == "ambient"]
+        sources = (
+            stated or self.heat_inputs,
+            [p.name for p in self.physics.parameters.values() if p.unit in TEMPERATURE],
+        )
+        for names in sources:
+            count = dict.fromkeys(names, 0)
+            for f in self.physics.flows.values():
+                ends = {e for e in (f.source, f.target) if e in self.temperatures}
+                if len(ends) == 1 and ends <= ex.names(f.rate):
+                    for i in ex.names(f.rate) & count.keys():
+                        count[i] += 1
+            count = {i: n for i, n in count.items() if n or i in stated}
+            if count:
+                return count
+        return {}
 
-    def _coolest(self) -> str | None:
-        """Return the temperature input that is the reference of heat losses."""
-        for f in self.physics.flows.values():
-            if f.target is None or f.source is None:
-                for i in self.heat_inputs:
-                    if i in ex.names(f.rate):
-                        return i
-        return self.heat_inputs[0] if self.heat_inputs else None
+    def _mean(self, signal: str) -> float:
+        if signal in self.plant.parameters:
+            return self.plant.parameters[signal].value
+        j = list(self.plant.inputs).index(signal)
+        return float(np.mean([d.u[:, j].mean() for d in self.drives])) if self.drives else 0.0
 
     def first_air(self, d: Excitation) -> float:
         """Return the ambient temperature at a recording's start, degC; 0 if there is none."""
@@ -168,15 +214,14 @@ class Rig:
         return float(start - zero_of(source.unit) if source else start)
 
     def signals(self, kind: str, near: str | None = None) -> list[str]:
-        """Return names that can stand for v, x, i or T: nodes, inputs and unread columns."""
+        """Return names that can stand for v, x, i or T: nodes, inputs and unread columns.
+
+        `near`: the velocity whose signals are wanted. For T, also unread columns whose name suggests nothing."""
         p = self.physics
         if kind == "v":
             if near in self.velocities:
                 return [near]
-            names = [
-                *self.velocities,
-                *(i for i in p.inputs if self.kind(p.inputs[i]) in ("velocity", "rotation")),
-            ]
+            names = [*self.velocities, *(i for i in p.inputs if self.kind(p.inputs[i]) in MOVING)]
             return (names or self.guessed("v"))[:3]
         if kind == "x":
             if near in self.position_of:
@@ -187,22 +232,42 @@ class Rig:
             names += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
             return (names or self.guessed("x"))[:3]
         if kind == "i":
-            names = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
-            names += [i for i in p.inputs if self.kind(p.inputs[i]) == "current"]
+            names = [
+                q.name for table in (p.nodes, p.inputs) for q in table.values() if self.kind(q) == "current"
+            ]
             return (names or self.guessed("i"))[:2]
-        names = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
-        return names + self.guessed("T")
+        warm = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
+        silent = (c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS))
+        return [*warm, *self.guessed("T"), *silent]
 
     def guessed(self, kind: str) -> list[str]:
         """Return the columns that the plant does not read and whose name suggests v, x, i or T."""
         return [c for c in self.spare if re.search(SOUNDS[kind], c, re.I)]
 
+    def guesses(self) -> list[str]:
+        """Return the assumptions about quantities that the plant file does not state."""
+        out = []
+        count = self._ambients()
+        if self.air and len(count) > 1:
+            out.append(
+                f"'{self.air}' is taken as the ambient, since most losses of heat are counted from it "
+                f"(also possible: {', '.join(sorted(count.keys() - {self.air}))}); `role: ambient` states it"
+            )
+        for v, x in self.pairs.items():
+            if _stated(self.physics.nodes[v]) not in MOVING:
+                out.append(f"'{x}' is taken as a position and '{v}' as its velocity, since '{v}' is its rate")
+        for c in self.spare:
+            kinds = [MEANINGS[kind] for kind in SOUNDS if c in self.guessed(kind)]
+            out.append(
+                f"the plant does not read the column '{c}': it may be a {' or a '.join(kinds or ['temperature'])}; "
+                "an input with a `role` states what it is"
+            )
+        return out
+
     def is_motor(self, f: Flow) -> bool:
         """Return whether a flow is a force or a torque that an input drives."""
-        return bool(
-            (f.target in self.velocities or f.source in self.velocities)
-            and ex.names(f.rate) & self.moving_inputs
-        )
+        moves = f.target in self.velocities or f.source in self.velocities
+        return moves and bool(ex.names(f.rate) & self.moving_inputs)
 
     def is_pump(self, f: Flow) -> bool:
         """Return whether a flow enters from outside and is neither heat nor a force."""
@@ -210,10 +275,7 @@ class Rig:
 
     def drives_of(self, f: Flow) -> list[str]:
         """Return the moving inputs that drive a flow, except temperatures, lengths and velocities."""
+        driving = [i for i in self.physics.inputs if i in ex.names(f.rate) & self.moving_inputs]
         return [
-            i
-            for i in self.physics.inputs
-            if i in ex.names(f.rate)
-            and i in self.moving_inputs
-            and self.kind(self.physics.inputs[i]) not in ("temperature", "length", "velocity", "rotation")
+            i for i in driving if self.kind(self.physics.inputs[i]) not in ("temperature", "length", *MOVING)
         ]

@@ -13,7 +13,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import law_effect, library, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
@@ -55,7 +55,7 @@ def refitted_law(
     that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
     for q in (p, *more):
-        rig = Structure(plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
+        rig = Rig(plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
         c = law_candidate(rig, q)
         values, ranges = _start(q)
         plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
@@ -67,7 +67,7 @@ def refitted_law(
         return None
 
 
-def law_candidate(rig: Structure, p: Proposal) -> Candidate:
+def law_candidate(rig: Rig, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
     effect = law_effect(p.terms, p.place, law_unit(rig.plant, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}

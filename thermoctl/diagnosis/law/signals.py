@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, zero_of
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, Rig, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.units import conversion, dimension
@@ -68,7 +67,7 @@ class Signal:
         return values % self.size if self.daily else values
 
 
-def places(rig: Structure) -> list[Place]:
+def places(rig: Rig) -> list[Place]:
     """Return the places of laws: flows into nodes, flows between connected nodes, and storages.
 
     A position is no such node. A storage of 1 is a definition: dn/dt is the sum of the flows."""
@@ -82,7 +81,7 @@ def places(rig: Structure) -> list[Place]:
     return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored]
 
 
-def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal]:
+def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs."""
     p, out = rig.physics, []
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
@@ -105,7 +104,7 @@ def signals(rig: Structure, place: Place, runs: Sequence[Values]) -> list[Signal
     return [s for s in sized if s is not None]
 
 
-def _absolute(rig: Structure, place: Place, n: str, unit: str | None) -> Signal:
+def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
     """Return a node or an input as a signal."""
     if unit in TEMPERATURE:
         return Signal(n, name(n), "K", kelvin=273.15 - zero_of(unit))
@@ -114,7 +113,7 @@ def _absolute(rig: Structure, place: Place, n: str, unit: str | None) -> Signal:
     return Signal(n, name(n), unit, position=is_position, drives=own, recorded=n in rig.physics.inputs)
 
 
-def _between(rig: Structure, place: Place, a: str, b: str) -> Signal:
+def _between(rig: Rig, place: Place, a: str, b: str) -> Signal:
     """Return the difference of two nodes as a signal."""
     unit = _difference(rig.physics.nodes[a].unit)
     difference = ex.add(name(a), ex.neg(name(b)))

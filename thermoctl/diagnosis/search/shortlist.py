@@ -40,7 +40,7 @@ def relabels(c: Candidate) -> bool:
 
 def _free_member(c: Candidate, side: str) -> bool:
     """Return whether the displacement contains this side's temperature already, with a free coefficient."""
-    now = ex.substitute(c.place.symbols["y"], lambda e: e.args[0] if e.op == "delay" else None)
+    now = ex.undelayed(c.place.symbols["y"])
     slope = ex.derivative(now, str(c.place.symbols[side].value))
     parameters = c.rig.plant.parameters
     return any(n in parameters and parameters[n].range for n in ex.names(slope))
