@@ -134,3 +134,34 @@ flows:
 outputs:
   level: {value: tank, unit: V, noise: 0.02}
 """
+
+HEATER = """
+format: thermoctl-plant/1
+title: one block
+inputs: {heat: {unit: W}, air: {unit: degC}}
+parameters:
+  C: {value: 40, unit: J/K, range: [20, 80]}
+  G: {value: 0.3, unit: W/K, range: [0.1, 1]}
+nodes: {block: {unit: degC, storage: C, initial: air, initial_sigma: 0.3}}
+flows:
+  power: {into: block, rate: heat, unit: W}
+  loss: {from: block, rate: G * (block - air), unit: W}
+outputs: {reading: {value: block, unit: degC, noise: 0.1}}
+"""
+
+WIDE_BLOCK = """\
+format: thermoctl-plant/1
+inputs:
+  heat: {unit: W}
+  air: {unit: degC, between_samples: linear}
+parameters:
+  C: {value: 80, unit: J/K, range: [20, 300]}
+  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
+nodes:
+  one: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
+flows:
+  power: {into: one, rate: heat, unit: W}
+  loss: {from: one, rate: G * (one - air), unit: W}
+outputs:
+  T: {value: one, unit: degC, noise: 0.05}
+"""

@@ -309,7 +309,7 @@ def ours(plant: Plant, d: Drawn) -> tuple[Plant, dict[str, Any]]:
     found = diagnose(plant, tables, catalogue(), limits())
     names = [f"{e.key[0]} at {e.key[1]}" for e in found.shown]
     law = str(law_rate(found.law.fitted)) if found.law else None
-    return found.extended, {
+    return found.final.plant, {
         "verdict": found.decision.verdict,
         "names": names,
         "law": law,

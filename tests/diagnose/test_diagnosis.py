@@ -59,16 +59,18 @@ def heater(
             x[k + 1] = solve_ivp(slope, (t[k], t[k + 1]), x[k], rtol=1e-6, atol=1e-8).y[:, -1]
         y = sensor(t, x) + rng.normal(0, 0.1, x.shape)
         path = folder / f"run_{seed}.csv"
-        np.savetxt(
+        write(
             path,
+            "t,heat,air_temperature,temperature_1,temperature_2",
             np.column_stack([t, heat, air, y]),
-            delimiter=",",
-            comments="",
-            fmt="%.7g",
-            header="t,heat,air_temperature,temperature_1,temperature_2",
+            "%.7g",
         )
         paths.append(path)
     return paths
+
+
+def write(path, names, rows, digits="%.9g"):
+    np.savetxt(path, rows, delimiter=",", comments="", fmt=digits, header=names)
 
 
 def diagnosed(paths, out):
@@ -79,7 +81,7 @@ def diagnosed(paths, out):
 
 def test_nothing_missing_is_said_with_what_would_have_been_seen(tmp_path):
     r = diagnosed(heater(tmp_path), tmp_path / "out")
-    assert r["verdict"] == "consistent" and r["findings"] == [] and r["mismatch"] == []
+    assert r["verdict"] == "consistent" and r["findings"] == r["mismatch"] == [] and r["remainder"] is None
     smallest = {(e["effect"], e["where"]): e["smallest"] for e in r["not_seen"]}
     assert smallest and all(size > 0 for size in smallest.values())
 
@@ -186,12 +188,10 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
         TWO_BLOCKS.replace("outputs:", "outputs:\n  voltage: {value: 3 * heat, unit: V, noise: 0.02}")
     )
     rows = np.loadtxt(run, delimiter=",", skiprows=1)
-    np.savetxt(
+    write(
         run,
+        "t,heat,air_temperature,temperature_1,temperature_2,voltage",
         np.column_stack([rows, 3 * rows[:, 1]]),
-        delimiter=",",
-        comments="",
-        header="t,heat,air_temperature,temperature_1,temperature_2,voltage",
     )
     plant, table = load(tmp_path / "plant.yaml"), read_table(run)
     drive = compile_plant(plant).excitation(table)
@@ -246,14 +246,7 @@ def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path, monk
         y = x + size * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
         assert np.ptp(x) > 70 * period
         paths.append(tmp_path / f"run_{seed}.csv")
-        np.savetxt(
-            paths[-1],
-            np.column_stack([t, force, y]),
-            delimiter=",",
-            comments="",
-            fmt="%.9g",
-            header="t,force,encoder",
-        )
+        write(paths[-1], "t,force,encoder", np.column_stack([t, force, y]))
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [
         ("cyclic_error", "encoder")
@@ -280,7 +273,7 @@ def test_dry_friction_that_sticks_is_no_load(tmp_path):
         assert np.ptp(seen[step % 30_000 > 29_000]) > 1e-6
         rows = np.column_stack([step * h, force, seen + rng.normal(0, 2e-6, len(step))])[::50]
         paths.append(tmp_path / f"run_{seed}.csv")
-        np.savetxt(paths[-1], rows, delimiter=",", comments="", fmt="%.9g", header="t,force,encoder")
+        write(paths[-1], "t,force,encoder", rows)
     r = diagnosed(paths, tmp_path / "out")
     assert [(f["effect"], f["where"]) for f in r["findings"]] == [("coulomb_friction", "velocity")] and r[
         "verdict"
@@ -303,7 +296,7 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     plant, run = tmp_path / "plant.yaml", tmp_path / "run.csv"
     plant.write_text(FREE_CARRIAGE.replace("noise: 5e-6, resolution: 1e-5", "noise: 5e-4"))
     rows = np.column_stack([t, force, ran.columns["encoder"] + rng.normal(0, 5e-4, len(t))])
-    np.savetxt(run, rows, delimiter=",", comments="", header="t,force,encoder")
+    write(run, "t,force,encoder", rows)
     r = diagnosed([plant, run], tmp_path / "out")
     # friction that differs with direction, which contains it, is tried too and keeps some probability
     assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "explained"
@@ -353,13 +346,11 @@ def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
                 atol=1e-9,
             ).y[0, -1]
         path = tmp_path / f"run_{seed}.csv"
-        np.savetxt(
+        write(
             path,
+            "t,pump,level_start,level",
             np.column_stack([t, pump, np.full(len(t), 2.0), x + rng.normal(0, 0.02, len(t))]),
-            delimiter=",",
-            comments="",
-            fmt="%.7g",
-            header="t,pump,level_start,level",
+            "%.7g",
         )
         paths.append(path)
     r = diagnosed(paths, tmp_path / "out")
@@ -425,14 +416,7 @@ outputs:
         force = rng.choice([-6.0, 0.0, 6.0], 40)[(t // 0.5).astype(int)]
         y = dlsim((A, B, C, D, 0.005), force)[1][:, 0] + rng.normal(0, 2e-5, len(t))
         paths.append(tmp_path / f"run_{seed}.csv")
-        np.savetxt(
-            paths[-1],
-            np.column_stack([t, force, y]),
-            delimiter=",",
-            comments="",
-            fmt="%.9g",
-            header="t,force,encoder",
-        )
+        write(paths[-1], "t,force,encoder", np.column_stack([t, force, y]))
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] not in ("explained", "consistent") and r["remainder"]["node"] == "velocity"
 
@@ -501,7 +485,7 @@ def _rewritten(path, change):
     """A recording with its columns changed: change(names, rows) -> rows."""
     names = path.read_text().splitlines()[0].split(",")
     rows = change(names, np.genfromtxt(path, delimiter=",", skip_header=1))
-    np.savetxt(path, rows, delimiter=",", comments="", fmt="%.7g", header=",".join(names))
+    write(path, ",".join(names), rows, "%.7g")
 
 
 def test_a_channel_whose_clock_runs_ahead_is_no_physics_of_the_catalogue(tmp_path):

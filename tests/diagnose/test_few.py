@@ -6,25 +6,10 @@ import numpy as np
 import pytest
 
 import thermoctl as tc
+from tests.plants import WIDE_BLOCK
 from thermoctl.cli import main
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.files import loads
-
-PLANT = """format: thermoctl-plant/1
-inputs:
-  heat: {unit: W}
-  air: {unit: degC}
-parameters:
-  C: {value: 80, unit: J/K, range: [20, 300]}
-  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
-nodes:
-  one: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
-flows:
-  power: {into: one, rate: heat, unit: W}
-  loss: {from: one, rate: G * (one - air), unit: W}
-outputs:
-  T: {value: one, unit: degC, noise: 0.05}
-"""
 
 
 def run(count, extra_w=0.0):
@@ -44,7 +29,7 @@ def run(count, extra_w=0.0):
 
 @pytest.mark.parametrize("count", [12, 20])
 def test_few_samples_of_stated_noise_are_enough(count):
-    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    plant = tc.Plant(loads(WIDE_BLOCK, "plant.yaml"))
     assert tc.diagnose(plant, run(count)).verdict == "consistent"
     found = tc.diagnose(plant, run(count, extra_w=2.0))
     assert found.verdict != "consistent"
@@ -52,18 +37,18 @@ def test_few_samples_of_stated_noise_are_enough(count):
 
 
 def test_of_unknown_noise_more_are_needed():
-    unknown = tc.Plant(loads(PLANT.replace(", noise: 0.05", ""), "plant.yaml"))
+    unknown = tc.Plant(loads(WIDE_BLOCK.replace(", noise: 0.05", ""), "plant.yaml"))
     for plant, data in (
         (unknown, run(20)),
-        (tc.Plant(loads(PLANT, "plant.yaml")), run(11)),
-        (tc.Plant(loads(PLANT, "plant.yaml")), [run(7), run(7)]),
+        (tc.Plant(loads(WIDE_BLOCK, "plant.yaml")), run(11)),
+        (tc.Plant(loads(WIDE_BLOCK, "plant.yaml")), [run(7), run(7)]),
     ):
         with pytest.raises(InputError, match="too little data: .* 40 are needed, or 12 where"):
             tc.diagnose(plant, data)
 
 
 def test_a_warning_of_the_plant_is_printed_once(tmp_path, capsys):
-    (tmp_path / "plant.yaml").write_text(re.sub(r"unit: [^,}]+(, )?", "", PLANT))
+    (tmp_path / "plant.yaml").write_text(re.sub(r"unit: [^,}]+(, )?", "", WIDE_BLOCK))
     data = run(20)
     rows = np.column_stack(list(data.values()))
     np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header=",".join(data), comments="")

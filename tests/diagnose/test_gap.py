@@ -3,23 +3,9 @@
 import numpy as np
 
 import thermoctl as tc
+from tests.plants import WIDE_BLOCK
 from thermoctl.plant.files import loads
 
-PLANT = """format: thermoctl-plant/1
-inputs:
-  heat: {unit: W}
-  air: {unit: degC}
-parameters:
-  C: {value: 80, unit: J/K, range: [20, 300]}
-  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
-nodes:
-  one: {unit: degC, storage: C, initial: 22, initial_sigma: 0.5}
-flows:
-  power: {into: one, rate: heat, unit: W}
-  loss: {from: one, rate: G * (one - air), unit: W}
-outputs:
-  T: {value: one, unit: degC, noise: 0.05}
-"""
 LAG_S = 30.0
 
 
@@ -37,5 +23,5 @@ def recording():
 
 
 def test_a_state_that_an_effect_adds_is_found_across_a_gap():
-    found = tc.diagnose(tc.Plant(loads(PLANT, "plant.yaml")), recording())
+    found = tc.diagnose(tc.Plant(loads(WIDE_BLOCK, "plant.yaml")), recording())
     assert [f.effect for f in found.findings] == ["sensor_lag"]

@@ -9,6 +9,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t, norm
 
+from tests.plants import HEATER
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
@@ -20,19 +21,6 @@ from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
-HEATER = """
-format: thermoctl-plant/1
-title: one block
-inputs: {heat: {unit: W}, air: {unit: degC}}
-parameters:
-  C: {value: 40, unit: J/K, range: [20, 80]}
-  G: {value: 0.3, unit: W/K, range: [0.1, 1]}
-nodes: {block: {unit: degC, storage: C, initial: air, initial_sigma: 0.3}}
-flows:
-  power: {into: block, rate: heat, unit: W}
-  loss: {from: block, rate: G * (block - air), unit: W}
-outputs: {reading: {value: block, unit: degC, noise: 0.1}}
-"""
 AXIS = """
 format: thermoctl-plant/1
 title: one axis

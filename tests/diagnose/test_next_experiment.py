@@ -278,7 +278,8 @@ def test_rounds_end_when_nothing_is_left_to_ask(tmp_path):
         ["run_1.csv"],
         tmp_path,
         lambda file, out: ran.append((file.name, out.name)),
-        rounds=3,
+        3,
+        print,
     )
     assert ran == [("next_experiment.yaml", "round_1.csv"), ("next_experiment.yaml", "round_2.csv")]
     assert [len(p) for p in asked] == [1, 2, 3] and end["verdict"] == "explained"

@@ -156,6 +156,7 @@ flows:
   outflow: {from: level, rate: "RATE", unit: m^3/s}
 outputs: {gauge: {value: level, unit: m, noise: 0.001}}
 """
+EMPTY = Table("run", "run", np.arange(200.0), {"inflow": np.zeros(200), "gauge": np.zeros(200)})
 
 
 @pytest.mark.parametrize(
@@ -168,16 +169,14 @@ outputs: {gauge: {value: level, unit: m, noise: 0.001}}
     ],
 )
 def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exponent):
-    t = np.arange(0.0, 200.0, 1.0)
     plant = loads(TANK.replace("RATE", rate))
-    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
-    c = offered(plant, table, "orifice_exponent")["outflow"]
+    c = offered(plant, EMPTY, "orifice_exponent")["outflow"]
     (n,) = c.effect.parameters
     assert n.null == exponent
 
     def level(p: Plant) -> np.ndarray:
         model = compile_plant(p)
-        return model.run(model.excitation(table)).x[:, 0]
+        return model.run(model.excitation(EMPTY)).x[:, 0]
 
     assert np.allclose(level(c.extend({})), level(plant), rtol=1e-6)
 
@@ -185,32 +184,28 @@ def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exp
         head = h - 0.02 if "0.02" in rate else h
         return -1e-3 * np.maximum(head, 0) ** 0.7 * (0.5 if "/ 2" in rate else 1) / 0.1
 
-    known = solve_ivp(fall, (0, t[-1]), [0.3], t_eval=t, rtol=1e-9, atol=1e-12).y[0]
+    known = solve_ivp(fall, (0, EMPTY.t[-1]), [0.3], t_eval=EMPTY.t, rtol=1e-9, atol=1e-12).y[0]
     assert np.allclose(level(c.extend({"N": 0.7})), known, rtol=1e-5, atol=1e-6)
 
 
 def test_a_vessel_may_overflow_beside_the_exponent_of_its_outlet():
     """A level in volts: only the power of it in the outflow tells a vessel."""
-    t = np.arange(0.0, 200.0, 1.0)
     text = (
         TANK.replace("RATE", "k * sqrt(max(level, 0))")
         .replace("m^3/s", "V/s")
         .replace("unit: m,", "unit: V,")
     )
     plant = loads(text)
-    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
-    assert set(offered(plant, table, "overflow")) == {"level"}
-    found = offered(plant, table, "orifice_exponent")["outflow"]
-    assert set(offered(found.extend({"N": 0.6}), table, "overflow")) == {"level"}
+    assert set(offered(plant, EMPTY, "overflow")) == {"level"}
+    found = offered(plant, EMPTY, "orifice_exponent")["outflow"]
+    assert set(offered(found.extend({"N": 0.6}), EMPTY, "overflow")) == {"level"}
 
 
 def test_only_a_level_has_an_outlet_and_only_of_its_own_head(motor):
     assert offered(*motor, "orifice_exponent") == {}
-    t = np.arange(0.0, 200.0, 1.0)
     drains = "  drain: {from: level, into: lower, rate: k * (level - lower)}"
     two = TANK.replace("RATE", "k").replace("0.3}}", "0.3}, lower: {unit: m, storage: 1, initial: 0}}")
     plant = loads(two.replace("outputs:", f"{drains}\noutputs:"))
-    table = Table("run", "run", t, {"inflow": np.zeros(len(t)), "gauge": np.zeros(len(t))})
-    assert offered(plant, table, "orifice_exponent") == {}
+    assert offered(plant, EMPTY, "orifice_exponent") == {}
     weir = loads(TANK.replace("RATE", "k * max(level, 0)**1.5"))  # no orifice
-    assert offered(weir, table, "orifice_exponent") == {}
+    assert offered(weir, EMPTY, "orifice_exponent") == {}

@@ -6,10 +6,9 @@ import json
 import signal
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from tests.plants import ONE_BLOCK
+from tests.diagnose.test_workers import rig
 from thermoctl.diagnosis.commands import on_interrupt
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.data.progress import Pace
@@ -18,7 +17,6 @@ from thermoctl.diagnosis.search import beam as search
 from thermoctl.files import shipped
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
-from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 PLANT = shipped.shipped("config") / "plants" / "actuator_thermal.yaml"
@@ -99,22 +97,14 @@ def foreground():
 
 def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path, foreground):
     """Radiation is concealed; Ctrl-C comes during the second and third refit, which run side by side."""
-    path = tmp_path / "plant.yaml"
-    lost = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
-    path.write_text(ONE_BLOCK.replace("flows:\n", f"flows:\n  concealed: {lost}\n"))
-    t = np.arange(400.0)
-    heat = 12.0 * np.random.default_rng(4).integers(0, 2, 8)[(t // 50).astype(int)]
-    table = compile_plant(load(path)).measure(
-        Table("run", "run", t, {"heat": heat, "air": 20 + 0 * t}), seed=1
-    )
-    path.write_text(ONE_BLOCK)
+    plant, tables = rig(tmp_path, recordings=1)
     with on_interrupt() as stopped:
 
         def progress(text: str) -> None:
             if "refit 2 of" in text:
                 signal.raise_signal(signal.SIGINT)
 
-        found = diagnose(load(path), [table], tmp_path / "out", progress=progress, stopped=stopped)
+        found = diagnose(plant, tables, tmp_path / "out", progress=progress, stopped=stopped)
     assert len(found["hypotheses"]) == 2  # without an effect, and the one whose refit was under way
     assert found["truncated"] and found["notes"][0].startswith("stopped by hand after 2 refits")
     assert found["verdict"] == "ambiguous"  # a likelier one may be among those not tried

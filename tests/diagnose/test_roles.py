@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from tests.diagnose.changes import Given, kelvin, milliwatt, names, order
+from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
@@ -142,8 +143,9 @@ def _changes(rig: Given) -> dict[tuple, tuple[dict, dict]]:
     drive = dataclasses.replace(
         model.prepare(model.excitation(table)), rtol=1e-11
     )  # the trajectories are one
-    fit = SimpleNamespace(values=[model.vector(None)])
-    metric = SimpleNamespace(drives=[drive], runs=[model.run(drive)], model=model, fit=fit)
+    run = model.run(drive)
+    along = signals(model, drive, model.vector(None), run.x)
+    metric = SimpleNamespace(drives=[drive], runs=[run], signals=[along])
     at, out = Trajectory(metric, structure, 0), {}
     for c in candidates(structure, catalogue()):
         if not c.place.input:  # an input's fault is in the input's own unit

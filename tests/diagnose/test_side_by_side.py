@@ -5,25 +5,14 @@ from __future__ import annotations
 import json
 import threading
 
-import numpy as np
-
-from tests.plants import ONE_BLOCK
+from tests.diagnose.test_workers import rig
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import beam as search
-from thermoctl.plant import load
 from thermoctl.plant.fitting import cores
-from thermoctl.plant.simulation.simulate import compile_plant
-from thermoctl.recording.table import Table
 
 
 def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
-    path, t = tmp_path / "plant.yaml", np.arange(400.0)
-    lost = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
-    path.write_text(ONE_BLOCK.replace("flows:\n", f"flows:\n  concealed: {lost}\n"))
-    heat = 12.0 * np.random.default_rng(4).integers(0, 2, 8)[(t // 50).astype(int)]
-    inputs = {"heat": heat, "air": 20 + 0 * t}
-    table = compile_plant(load(path)).measure(Table("run", "run", t, inputs), seed=1)
-    path.write_text(ONE_BLOCK)
+    plant, tables = rig(tmp_path, recordings=1)
     written, threads = [], []
     for n in (1, 2):
         monkeypatch.setattr(cores, "_cores", lambda n=n: n)
@@ -36,7 +25,7 @@ def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
 
         with monkeypatch.context() as patch:
             patch.setattr(search, "each", each)
-            diagnose(load(path), [table], tmp_path / f"out{n}")
+            diagnose(plant, tables, tmp_path / f"out{n}")
         threads.append(len(seen))
         found = json.loads((tmp_path / f"out{n}" / "diagnosis.json").read_text())
         found.pop("seconds")

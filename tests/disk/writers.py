@@ -201,7 +201,7 @@ def _write_diagnosis() -> None:
 
 def _api_save() -> None:
     found, content = FOUND[0][2], FOUND[0][3]
-    of = SimpleNamespace(plant=SimpleNamespace(description=found.extended), json=content)
+    of = SimpleNamespace(plant=SimpleNamespace(description=found.final.plant), json=content)
     diagnosing.Diagnosis.save(of, "result")  # type: ignore[arg-type]
 
 

@@ -69,7 +69,7 @@ def judge(made: Made, full: bool) -> dict[str, Any]:
     started = time.process_time()
     numbers = limits()
     d = diagnose(made.plant, made.tables[:3], catalogue() if full else {}, numbers)
-    law, plant, null = d.law, d.extended, d.null.plant
+    law, plant, null = d.law, d.final.plant, d.null.plant
     named = [f"{e.key[0]} at {e.key[1]}" for e in d.shown]
     verdict = d.decision.verdict
     out: dict[str, Any] = {
@@ -141,22 +141,22 @@ def _misfit(plant: Plant, made: Made) -> float:
     return float(np.sum(np.maximum(np.mean(error**2, axis=0) - 1, 0)))
 
 
+def _signals(plant: Plant, table: Table) -> dict[str, Any]:
+    """Inputs, states and time along a plant's free run of a recording."""
+    model = compile_plant(plant)
+    d = model.excitation(table)
+    inputs = dict(zip(model.inputs, d.u.T, strict=False))  # delayed inputs have columns of their own
+    return {**inputs, **dict(zip(model.states, model.run(d).x.T, strict=True)), "t": d.t, "pi": np.pi}
+
+
 def difference(plant: Plant, made: Made) -> float:
     """Rms difference of the rates dx/dt at the law's place, along the truth's last run, over that of the law."""
-    model = compile_plant(made.truth)
-    d = model.excitation(made.tables[-1])
-    x = model.run(d).x
-    trajectory = {
-        **dict(zip(model.inputs, d.u.T, strict=False)),
-        **dict(zip(model.states, x.T, strict=True)),
-        "t": d.t,
-        "pi": np.pi,
-    }
-    trajectory |= _memories(plant, trajectory, d.t)
+    trajectory = _signals(made.truth, made.tables[-1])
+    trajectory |= _memories(plant, trajectory, trajectory["t"])
 
     def net(p: Plant) -> np.ndarray:
         known = {**trajectory, **{k: v.value for k, v in p.parameters.items()}}
-        total = np.zeros(len(d.t))
+        total = np.zeros(len(trajectory["t"]))
         for f in p.flows.values():
             if made.law.target in (f.source, f.target):
                 total = total + (1 if f.target == made.law.target else -1) * np.asarray(
@@ -195,18 +195,10 @@ def _memories(plant: Plant, trajectory: dict[str, Any], t: np.ndarray) -> dict[s
 
 def _variables(law: FoundLaw, made: Made) -> set[str]:
     """The signals of the terms that matter, without the ambient."""
-    model = compile_plant(made.plant)
-    d = model.excitation(made.tables[0])
-    x = model.run(d).x
-    run = {
-        **dict(zip(model.inputs, d.u.T, strict=False)),
-        **dict(zip(model.states, x.T, strict=True)),
-        "t": d.t,
-        "pi": np.pi,
-    }
+    run = _signals(made.plant, made.tables[0])
     sizes, out, at = [], set(), 0
     for k, t in enumerate(law.proposal.terms):
-        flow = t.values(run, d.t) @ np.array(law.proposal.sizes[at : at + len(t.form.sizes)])
+        flow = t.values(run, run["t"]) @ np.array(law.proposal.sizes[at : at + len(t.form.sizes)])
         at += len(t.form.sizes)
         sizes.append((k, float(np.sqrt(np.mean(flow**2)))))
     for k, size in sizes:

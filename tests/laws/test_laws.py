@@ -233,7 +233,10 @@ def test_a_larger_storage_is_no_law_where_the_plant_has_a_parameter_for_it():
     at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
     flows = [np.ones((len(d.t), 1)) for d in at.metric.drives]
     assert abs(_cosine(at, Place("broth", None, "storage"), flows)) < 0.05
-    assert abs(_cosine(at, Place("broth"), [np.asarray(run["current"])[:, None] for run in at.runs])) > 0.95
+    assert (
+        abs(_cosine(at, Place("broth"), [np.asarray(run["current"])[:, None] for run in at.metric.signals]))
+        > 0.95
+    )
 
 
 def _cosine(at, place, flows):

@@ -27,7 +27,7 @@ def test_two_laws_missing_at_once_are_found_at_both_places():
     assert not found.shown
     assert set(found.decision.named) == {("law", "rabbits"), ("law", "wolves")}
     for node, size in (("rabbits", -0.9), ("wolves", 0.8)):
-        q = {k: found.extended.parameters[f"{k}1_law_{node}"].value for k in "AZW"}
+        q = {k: found.final.plant.parameters[f"{k}1_law_{node}"].value for k in "AZW"}
         assert q["A"] / (q["Z"] * q["W"]) == pytest.approx(size, rel=0.01)
 
 

@@ -6,28 +6,13 @@ import numpy as np
 import pytest
 
 import thermoctl as tc
+from tests.plants import WIDE_BLOCK
 from thermoctl.cli import main
 from thermoctl.plant.files import loads
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.parts import in_parts
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
-
-PLANT = """format: thermoctl-plant/1
-inputs:
-  heat: {unit: W}
-  air: {unit: degC, between_samples: linear}
-parameters:
-  C: {value: 80, unit: J/K, range: [20, 300]}
-  G: {value: 0.3, unit: W/K, range: [0.05, 2]}
-nodes:
-  one: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}
-flows:
-  power: {into: one, rate: heat, unit: W}
-  loss: {from: one, rate: G * (one - air), unit: W}
-outputs:
-  T: {value: one, unit: degC, noise: 0.05}
-"""
 
 
 def run(jump_s=0.0, missing=None, heat_between=10.0):
@@ -55,7 +40,7 @@ def run(jump_s=0.0, missing=None, heat_between=10.0):
     ids=["a gap", "an hour", "another jump"],
 )
 def test_parts_start_by_their_readings(table, word):
-    plant = loads(PLANT, "plant.yaml")
+    plant = loads(WIDE_BLOCK, "plant.yaml")
     parts = in_parts(plant, table)
     assert len(parts) == 2 and sum(map(len, parts)) == len(table)
     assert any(word in n for n in parts[0].notes), parts[0].notes
@@ -67,14 +52,14 @@ def test_parts_start_by_their_readings(table, word):
 
 
 def test_a_whole_recording_is_one_part():
-    plant = loads(PLANT, "plant.yaml")
+    plant = loads(WIDE_BLOCK, "plant.yaml")
     table = run()
     assert in_parts(plant, table) == [table]
 
 
 def test_an_unknown_state_after_a_gap_leaves_the_rest_out():
     plant = loads(
-        PLANT.replace(", initial_sigma: 0.5", "").replace("value: one,", "value: 2 * one,"), "plant.yaml"
+        WIDE_BLOCK.replace(", initial_sigma: 0.5", "").replace("value: one,", "value: 2 * one,"), "plant.yaml"
     )
     (part,) = in_parts(plant, run(missing=(400, 600)))
     assert part.t[-1] < 400 and any("nothing states where 'one' starts" in n for n in part.notes)
@@ -82,7 +67,7 @@ def test_an_unknown_state_after_a_gap_leaves_the_rest_out():
 
 @pytest.mark.filterwarnings("ignore:.*each with a start of its own")
 def test_python_splits_at_a_gap_too():
-    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    plant = tc.Plant(loads(WIDE_BLOCK, "plant.yaml"))
     table = run(missing=(400, 600))
     frame = {"t": table.t, **table.columns}
     with pytest.warns(UserWarning, match="no samples from t = 398 to 600 s"):
@@ -100,7 +85,7 @@ def test_python_splits_at_a_gap_too():
 
 
 def test_inputs_alone_are_a_schedule():
-    plant = tc.Plant(loads(PLANT, "plant.yaml"))
+    plant = tc.Plant(loads(WIDE_BLOCK, "plant.yaml"))
     t = np.array([*range(20), 500.0, 1000.0])
     inputs = {"t": t, "heat": np.where(t < 10, 5.0, 0.0), "air": np.full(len(t), 22.0)}
     with warnings.catch_warnings():
@@ -114,7 +99,7 @@ def test_simulate_starts_each_part_by_its_readings(tmp_path, capsys):
     rows = np.column_stack([table.t, *table.columns.values()])
     np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="t,heat,air,T", comments="")
     (tmp_path / "plant.yaml").write_text(
-        PLANT.replace("C: {value: 80", "C: {value: 100").replace("0.3, u", "0.2, u")
+        WIDE_BLOCK.replace("C: {value: 80", "C: {value: 100").replace("0.3, u", "0.2, u")
     )
     given = ["simulate", "--plant", str(tmp_path / "plant.yaml"), str(tmp_path / "run.csv")]
     assert main([*given, "--out", str(tmp_path / "out.csv")]) == 0

@@ -80,7 +80,7 @@ class Diagnosis:
     @property
     def plant(self) -> Plant:
         """The plant with the findings and refitted parameters."""
-        return Plant(self.found.extended)
+        return Plant(self.found.final.plant)
 
     def save(self, folder: str | Path) -> None:
         """Write diagnosis.json and plant.yaml."""

@@ -113,12 +113,15 @@ def diagnose(args: argparse.Namespace) -> int:
         )
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
-        """Diagnose the recordings of the command line, and those that --resolve has recorded since."""
         added = read_recordings(plant, recordings[len(args.recordings) :])  # recordings that --resolve made
         return _run(args, plant, [*given, *added], held_out)
 
     try:
-        result = _resolved(args, diagnosed) if args.resolve else diagnosed(args.recordings)
+        if args.resolve:
+            say = functools.partial(print, file=sys.stderr, flush=True)
+            result = resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
+        else:
+            result = diagnosed(args.recordings)
     except KeyboardInterrupt:
         print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
         raise
@@ -151,14 +154,6 @@ def _run(
             Path(args.continued) if args.continued else None,
             anyway=args.anyway,
         )
-
-
-def _resolved(
-    args: argparse.Namespace, diagnosed: Callable[[Sequence[str]], dict[str, Any]]
-) -> dict[str, Any]:
-    """Diagnose, record what is proposed, and diagnose again (`--resolve`)."""
-    say = functools.partial(print, file=sys.stderr, flush=True)
-    return resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
 
 
 def parsed_limits(texts: Sequence[str]) -> dict[str, tuple[float, float]]:

@@ -90,65 +90,40 @@ def sought(
 
 def decided(sought: Sought) -> Diagnosis:
     """Decide a search: posterior, findings and their worth, remainder, verdict, missing flow."""
-    diagnosis = _decided(sought)
-    if diagnosis.decision.verdict != "consistent" and not diagnosis.shown and diagnosis.before.node:
-        diagnosis = replace(
-            diagnosis, missing_flow=missing_flow(sought.case, diagnosis.null, diagnosis.before.node)
-        )
-    return diagnosis
-
-
-def _decided(sought: Sought) -> Diagnosis:
-    known, searched, numbers, reserve = sought.case, sought.searched, sought.limits, sought.reserve
+    known, searched, numbers = sought.case, sought.searched, sought.limits
     energy = energies(known, searched, numbers)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
-    fits = {keys: w.fitted for keys, w in tried.items()}
-    scores = {keys: tried[keys].score for keys in physics}
-    posterior = weigh(scores, physics)
-    best = null = with_residuals(known, as_refitted(known, fits[frozenset()]))
-    asked: dict[Key, float] = {}
-    if posterior.something >= numbers.name:
-        likeliest = next(keys for keys in posterior.hypotheses if keys)
-        stand = supported(likeliest, physics)  # the other effects are part of the remainder
-        chosen = stand if stand in fits else likeliest
-        kept = chosen
-        # beside known physics whose residual is only noise, there is no misfit that it could imitate
-        if reserve or any(key[0] == LAW for key in chosen) or not only_noise(known, fits[chosen], numbers):
-            kept, posterior, asked = confirmed(posterior, chosen, Confirm(known, fits, reserve), numbers.name)
-        else:  # but evidence that nothing else confirms counts less
-            posterior = weigh(scores, physics, numbers.unasked)
-            kept = chosen if posterior.something >= numbers.name else frozenset()
-        best = with_residuals(known, fits[kept]) if kept else null
+    chosen, posterior, asked = _chosen(sought, tried, physics)
+    null = with_residuals(known, as_refitted(known, tried[frozenset()].fitted))
+    best = with_residuals(known, tried[chosen].fitted) if chosen else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
-    value = worth(known, null, best, reserve)
+    value = worth(known, null, best, sought.reserve)
     keys = () if sought.unsure else (e.key for e in best.hypothesis.effects)
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
     # data that took part in the choice cannot speak against it
-    checked = bool(best.hypothesis.effects) and value.reserved
-    ratio, worse = (_ratio(value.after, value.refit_only), value.worse) if checked else (1.0, 0.0)
-    remains = remainder(known, fits[best.hypothesis.keys])
+    checked = bool(chosen) and value.reserved
+    remains = remainder(known, tried[chosen].fitted)
     unknown = Missing()
     if remains < numbers.name:
-        unknown = flow_missing(known, fits[best.hypothesis.keys], reach.nodes, numbers)
+        unknown = flow_missing(known, tried[chosen].fitted, reach.nodes, numbers)
     if unknown.probability >= numbers.name:
         after = replace(after, node=unknown.node or after.node)
-        before = before if best.hypothesis.effects else after
+        before = before if chosen else after
     facts = Facts(
-        posterior.something,
-        posterior.something if best.hypothesis.effects or not asked else 0.0,
-        named,
-        max(after.over_noise.values()),
-        ratio,
-        remains,
-        worse,
-        unknown.probability,
+        something=posterior.something,
+        known=posterior.something if chosen or not asked else 0.0,
+        named=named,
+        over_noise=max(after.over_noise.values()),
+        worth=_ratio(value.after, value.refit_only) if checked else 1.0,
+        remains=remains,
+        worse=value.worse if checked else 0.0,
+        flow=unknown.probability,
     )
     decision = decide(posterior, facts, numbers)
-    doubt = unknown.doubt(decision.verdict, numbers)
-    return Diagnosis(
+    diagnosis = Diagnosis(
         known,
         searched,
         posterior,
@@ -160,11 +135,39 @@ def _decided(sought: Sought) -> Diagnosis:
         decision,
         energy,
         physics,
-        doubt,
+        unknown.doubt(decision.verdict, numbers),
         asked,
         families=families(posterior, physics, decision.named, known.catalogue, asked, numbers.name),
         law=_law(known, tried, best, decision, posterior, asked),
     )
+    if decision.verdict != "consistent" and not diagnosis.shown and before.node:
+        return replace(diagnosis, missing_flow=missing_flow(known, null, before.node))
+    return diagnosis
+
+
+def _chosen(
+    sought: Sought, tried: Mapping[Keys, Weighed], physics: Mapping[Keys, Mapping[Key, float]]
+) -> tuple[Keys, Probabilities, dict[Key, float]]:
+    """Return the effects that stand, the posterior, and the probability that each tested one is confirmed.
+
+    `physics`: by hypothesis, the probability that each effect is physics and no misfit."""
+    known, numbers = sought.case, sought.limits
+    scores = {keys: tried[keys].score for keys in physics}
+    posterior = weigh(scores, physics)
+    if posterior.something < numbers.name:
+        return frozenset(), posterior, {}
+    likeliest = next(keys for keys in posterior.hypotheses if keys)
+    chosen = supported(likeliest, physics)  # the other effects are part of the remainder
+    if chosen not in tried:
+        chosen = likeliest
+    law = any(key[0] == LAW for key in chosen)
+    # beside known physics whose residual is only noise, there is no misfit that it could imitate
+    if sought.reserve or law or not only_noise(known, tried[chosen].fitted, numbers):
+        fits = {keys: w.fitted for keys, w in tried.items()}
+        return confirmed(posterior, chosen, Confirm(known, fits, sought.reserve), numbers.name)
+    # but evidence that nothing else confirms counts less
+    posterior = weigh(scores, physics, numbers.unasked)
+    return (chosen if posterior.something >= numbers.name else frozenset()), posterior, {}
 
 
 def _law(

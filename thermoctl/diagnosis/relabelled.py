@@ -22,7 +22,7 @@ import numpy as np
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
 from thermoctl.diagnosis.data.case import Budget, Case, case
-from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
+from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
@@ -75,12 +75,14 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
     if stays and _misfit(again, leader.fitted, limits) >= HALF * stays:
         return None
     effects = ", ".join(f"{e} at {w}" for e, w in sorted(leader.fitted.hypothesis.keys))
+    present_effects = ", ".join(f"{e.key[0]} at {e.key[1]}" for e in found.best.hypothesis.effects)
     a, b = h.columns
     return Finding(
         "swapped",
         where,
-        f"the columns '{a}' and '{b}' are swapped: so read, the recordings fit the plant {_with(effects)}better than with "
-        f"{_listed(found.best.hypothesis.effects)} as they are ({exp(min(leader.score - max(now.values()), 200.0)):.0e} times as likely)",
+        f"the columns '{a}' and '{b}' are swapped: so read, the recordings fit the plant "
+        f"{f'with {effects} ' if effects else ''}better than with {present_effects or 'no effect'} as they are "
+        f"({exp(min(leader.score - max(now.values()), 200.0)):.0e} times as likely)",
         h.suggestion,
     )
 
@@ -88,14 +90,6 @@ def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, wher
 def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:
     """Return the sum over outputs of the residual's mean square over the noise, above `clean` squared."""
     return sum(max(x**2 - limits.clean**2, 0.0) for x in over_noise(case, f))
-
-
-def _with(effects: str) -> str:
-    return f"with {effects} " if effects else ""
-
-
-def _listed(effects: Sequence[Placed]) -> str:
-    return ", ".join(f"{e.key[0]} at {e.key[1]}" for e in effects) or "no effect"
 
 
 def absurd(found: Diagnosis, where: str) -> list[Finding]:

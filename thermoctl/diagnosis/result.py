@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from thermoctl.diagnosis.curves import Curve, curves_of
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed
-from thermoctl.diagnosis.evidence.held_out import Worth
+from thermoctl.diagnosis.evidence.held_out import Worth, rms_of
 from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key
@@ -31,16 +32,13 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 MOVES = 6.0  # an output moves if its spread is this many standard deviations of its noise
-FOLLOWS = (
-    0.3  # largest residual variance over the output's, if the plant is of this rig and lacks some physics
-)
+# Largest residual variance over the output's, if the plant is of this rig and lacks some physics.
+FOLLOWS = 0.3
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
-BLOCKS, LARGE = (
-    40,
-    1.5,
-)  # number of blocks of a recording; least rms of a block with a large error, over that of the recording
+# Number of blocks of a recording; least rms of a block with a large error, over that of the recording.
+BLOCKS, LARGE = 40, 1.5
 
 
 @dataclass(frozen=True)
@@ -111,20 +109,16 @@ class Diagnosis:
         except SimulationError:
             return None
 
-    @property
-    def extended(self) -> Plant:
-        """Return the refitted plant with the findings and the law."""
-        return self.final.plant
-
 
 def curves(d: Diagnosis) -> list[Curve]:
     """Return the measured and simulated outputs: those held out, then those of the fit."""
-    fitted = {"before": d.came or (), "refit_only": d.null.fit.residuals, "after": d.final.fit.residuals}
-    aside = dict(d.worth.errors) if d.extends else {k: v for k, v in d.worth.errors.items() if k != "after"}
+    after = d.best.fit.residuals if d.extends else ()
+    fitted = {"before": d.came or (), "refit_only": d.null.fit.residuals, "after": after}
+    aside = {k: v for k, v in d.worth.errors.items() if d.extends or k != "after"}
     plant, model = d.case.plant, d.null.fit.model
     return [
         *curves_of(plant, [model.excitation(t) for t in d.worth.tables], aside, True),
-        *curves_of(plant, d.case.drives(model), fitted if d.extends else {**fitted, "after": ()}, False),
+        *curves_of(plant, d.case.drives(model), fitted, False),
     ]
 
 
@@ -166,7 +160,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             if stays
             else None,
             "fit": {
-                "before": _as_it_came(d),
+                "before": rms_of(d.came, list(outputs)) if d.came else dict.fromkeys(outputs, float("nan")),
                 "refit_only": d.null.fit.rms(),
                 "after": d.final.fit.rms(),
                 "converged": d.null.fit.converged and d.final.fit.converged,
@@ -227,11 +221,7 @@ def unfinished(*fits: Fitted) -> list[str]:
     }
     return [
         f"the refit of {name} ended after {fit.iterations} steps below its maximum; another promised {0.5 * fit.left:.2g} nats: "
-        + (
-            "its probability may be too small"
-            if 0.5 * fit.left > MATTERS
-            else "too few to change a probability"
-        )
+        f"{'its probability may be too small' if 0.5 * fit.left > MATTERS else 'too few to change a probability'}"
         for name, fit in names.items()
     ]
 
@@ -252,22 +242,19 @@ def doubts(case: Case, fit: Fit, noise: Mapping[str, float]) -> list[str]:
             "no input changes and no output moves: almost nothing is excited, so almost nothing could be seen; "
             "record a run with changing inputs"
         ]
-    rms, out = fit.rms(), []
-    for j, o in enumerate(model.outputs):
-        if o in spread and spread[o] > MOVES * noise[o]:
-            swing = float(np.nanstd(recorded[:, j]))
-            if rms[o] ** 2 > FOLLOWS * swing**2:
-                out.append(
-                    f"the plant follows {o} only roughly (error {rms[o]:.3g}, standard deviation of the reading {swing:.3g}): "
-                    "check that the recording is of this rig, in the plant's units, on one clock"
-                )
-    return out
+    swing = {o: float(np.nanstd(recorded[:, model.outputs.index(o)])) for o in spread}
+    return [
+        f"the plant follows {o} only roughly (error {error:.3g}, standard deviation of the reading {swing[o]:.3g}): "
+        "check that the recording is of this rig, in the plant's units, on one clock"
+        for o, error in fit.rms().items()
+        if o in spread and spread[o] > MOVES * noise[o] and error**2 > FOLLOWS * swing[o] ** 2
+    ]
 
 
 def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
     plant, effect = d.best.plant, e.candidate.effect
     values = {n: plant.parameters[n] for n in e.own.values()}
-    ends = {p.shape: plant.parameters[e.own[p.name]].value for p in effect.parameters if p.name in e.own}
+    ends = {p.shape: values[e.own[p.name]].value for p in effect.parameters if p.name in e.own}
     last = max(float(t.t[-1] - t.t[0]) for t in d.case.tables)
     first = ends.get("onset", ends.get("start"))
     equation = _equation(plant, e)
@@ -289,12 +276,10 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
 def _equation(after: Plant, e: Placed) -> str:
     """Return the expression that the effect adds or changes, as text."""
     mine = set(e.own.values())
-    for f in reversed(list(after.flows.values())):
-        if ex.names(f.rate) & mine:
-            return str(f.rate)
-    for o in after.outputs.values():
-        if ex.names(o.value) & mine:
-            return str(o.value)
+    changed = (*(f.rate for f in reversed(after.flows.values())), *(o.value for o in after.outputs.values()))
+    for expression in changed:
+        if ex.names(expression) & mine:
+            return str(expression)
     for n in after.nodes.values():
         if ex.names(n.storage) & mine:
             net = " ".join(
@@ -337,7 +322,7 @@ def _when(d: Diagnosis, output: str) -> list[list[float]]:
     edges = np.linspace(0, len(errors[r]), min(BLOCKS, len(errors[r])) + 1).astype(int)
     t = d.case.tables[r].t - d.case.tables[r].t[0]
     out: list[list[float]] = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         part = errors[r][a:b]
         if np.isfinite(part).any() and np.nanmean(part**2) > LARGE**2 * sizes[r]:
             start, end = float(t[a]), float(t[min(b, len(t) - 1)])
@@ -346,19 +331,6 @@ def _when(d: Diagnosis, output: str) -> list[list[float]]:
             else:
                 out.append([start, end])
     return out
-
-
-def _as_it_came(d: Diagnosis) -> dict[str, float]:
-    """Return the rms error of the plant with the parameters of its file."""
-    names = list(d.case.plant.outputs)
-    if d.came is None:
-        return dict.fromkeys(names, float("nan"))
-    errors = np.concatenate(d.came)
-    return {
-        o: float(np.sqrt(np.nanmean(errors[:, j] ** 2)))
-        for j, o in enumerate(names)
-        if np.isfinite(errors[:, j]).any()
-    }
 
 
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
@@ -401,23 +373,21 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
     final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
     for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
-        for key in sorted(keys - shown):
-            if key not in out:
-                beside = sorted(f"{e} at {at}" for e, at in keys - {key})
-                out[key] = {
-                    "effect": key[0],
-                    "where": key[1],
-                    "beside": beside,
-                    "probability": d.posterior.effects.get(key, 0.0),
-                    "below_best": final - w.score,
-                    "reason": UNCONFIRMED
-                    if key in d.refused
-                    else "less likely than the result"
-                    if w.score < final
-                    else "fits better, but not surely enough for a name"
-                    if key in standouts(d.physics.get(keys, {}))
-                    else "does not stand out of the misfit that it leaves",
-                }
+        for key in sorted(keys - shown - out.keys()):
+            out[key] = {
+                "effect": key[0],
+                "where": key[1],
+                "beside": sorted(f"{e} at {at}" for e, at in keys - {key}),
+                "probability": d.posterior.effects.get(key, 0.0),
+                "below_best": final - w.score,
+                "reason": UNCONFIRMED
+                if key in d.refused
+                else "less likely than the result"
+                if w.score < final
+                else "fits better, but not surely enough for a name"
+                if key in standouts(d.physics.get(keys, {}))
+                else "does not stand out of the misfit that it leaves",
+            }
     return sorted(out.values(), key=lambda e: (-e["probability"], e["below_best"]))
 
 

@@ -109,7 +109,7 @@ def _write(folder: Path, plant: Plant, diagnosis: Diagnosis, result: dict[str, A
     """Write all files of a result, or none."""
     with whole_files(folder, remove=experiment_file.FILES) as part:
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in diagnosis.shown)
-        save(diagnosis.extended, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
+        save(diagnosis.final.plant, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
         load(part / "plant.yaml")
         _report(diagnosis, result, part / "report.html")
         write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")

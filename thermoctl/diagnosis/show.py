@@ -37,17 +37,12 @@ def effects(args: argparse.Namespace) -> int:
             f"[bold]{e.name}[/]: {e.title}\nplace       {e.where}\nexcited by  {e.excited_by}\n"
             f"mimics      {', '.join(e.mimics) or '-'}\nsource      {e.source}"
         )
-        for number, change in enumerate(e.changes):
-            for item in change:
-                for kind, value in item.items():
-                    body = (
-                        ", ".join(f"{k}: {v}" for k, v in value.items())
-                        if isinstance(value, dict)
-                        else str(value)
-                    )
-                    console.print(
-                        f"{'change' if not number else f'variant {number}':11} {kind}: {body}", markup=False
-                    )
+        for number, changes in enumerate(e.changes):
+            head = f"variant {number}" if number else "change"
+            for kind, value in (pair for change in changes for pair in change.items()):
+                if isinstance(value, dict):
+                    value = ", ".join(f"{k}: {v}" for k, v in value.items())
+                console.print(f"{head:11} {kind}: {value}", markup=False)
         for p in e.parameters:
             console.print(
                 f"parameter   {p.name} [{p.unit or '1'}] {p.low:g} .. {p.high:g}, absent at {p.null:g}",

@@ -62,6 +62,3 @@ def cluster(scheduler: str | None) -> Iterator[None]:
         raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({e})") from None
     with client, elsewhere(DaskWorkers(client)):
         yield
-
-
-__all__ = ["DaskWorkers", "cluster"]

@@ -598,6 +598,11 @@ def evaluate(
     return done[id(expr)]
 
 
+def series(expr: Expr, values: Mapping[str, Any], t: np.ndarray) -> np.ndarray:
+    """Return the values (N,) of an expression at the times t (N,), also of one that is constant."""
+    return np.broadcast_to(np.asarray(evaluate(expr, values), float), t.shape)
+
+
 _NUMPY: dict[str, Callable[..., Any]] = {
     "+": np.add,
     "*": np.multiply,

@@ -114,6 +114,12 @@ class Case:
     memory: Memory = NOTHING  # posterior of earlier recordings
     outliers: Outliers = ()
 
+    @property
+    def measured(self) -> list[str]:
+        """Return the names of the outputs that `grids` are of."""
+        channels = (self.coordinates.channels[g.channels[0]] for g in self.grids)
+        return [self.null.model.outputs[c.output] for c in channels]
+
     def drives(self, model: Model) -> list[Excitation]:
         """Return the recordings as a model reads them. Models that read the same columns share the arrays.
 
@@ -142,7 +148,6 @@ def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
     plant, read = model.plant, direct_outputs(model.plant)
 
     def start(state: str) -> float:
-        """Return the start of one state."""
         if state in known:
             return float(known[state])
         if read.get(state) in d.first:
@@ -193,7 +198,9 @@ def case(
     tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     coordinates = Coordinates(drives)
-    rig = Rig(plant, drives, [t.columns for t in tables])
+    left_out = [outlier_note(dropped)] if dropped else []
+    averaged = [fewer.note] if fewer.block > 1 else []
+    guesses = Rig(plant, drives, [t.columns for t in tables]).guesses()
     return Case(
         plant,
         tuple(tables),
@@ -203,17 +210,12 @@ def case(
         coordinates,
         _grids(coordinates, drives, null, fewer),
         budget,
-        [
-            *freed,
-            *([fewer.note] if fewer.block > 1 else []),
-            *([outlier_note(dropped)] if dropped else []),
-            *rig.guesses(),
-        ],
-        fewer.block,
-        off,
-        rtol,
-        memory,
-        dropped,
+        notes=[*freed, *averaged, *left_out, *guesses],
+        block=fewer.block,
+        off=off,
+        rtol=rtol,
+        memory=memory,
+        outliers=dropped,
     )
 
 
@@ -222,30 +224,14 @@ def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
     outputs = list(model.plant.outputs.values())
     measured = np.array([np.isfinite(d.y).sum(axis=0) for d in drives])
     counts = np.where(measured >= FEWEST, measured, 0).sum(axis=0)
-    stated = [bool(o.noise_sd or o.resolution) for o in outputs]
     over = counts.sum() >= 2 * (len(model.active) + len(drives) * len(model.uncertain))
-    if any(
-        n >= (STATED if is_stated and over else LEAST) for n, is_stated in zip(counts, stated, strict=True)
-    ):
+    needed = [STATED if over and (o.noise_sd or o.resolution) else LEAST for o in outputs]
+    if (counts >= needed).any():
         return
     raise InputError(
         f"{paths}: too little data: at most {max(counts, default=0)} measured values of one output "
         f"({', '.join(o.column for o in outputs)}) in recordings of {FEWEST} or more; {LEAST} are needed, or {STATED} where "
         "the plant file states the output's noise and all outputs have twice as many values as there are unknowns"
-    )
-
-
-def with_tables(case: Case, tables: Sequence[Table]) -> Case:
-    """Return the case with other recordings, such as parts of its own, and the plant refitted to them.
-
-    Noise and accuracy are those of the case. Rows are not averaged again."""
-    model = compile_plant(case.plant)
-    drives = [dataclasses.replace(model.excitation(t), rtol=case.rtol) for t in tables]
-    null = fit(model, drives, case.noise, iterations=40, tolerance=ROUGH, seconds=np.inf)
-    coordinates = Coordinates(drives)
-    grids = _grids(coordinates, drives, null, Reduced(list(tables), case.block, 0, 0))
-    return dataclasses.replace(
-        case, tables=tuple(tables), null=null, coordinates=coordinates, grids=grids, block=1
     )
 
 
@@ -255,8 +241,11 @@ def _grids(
     """Return the frequency grid of each measured output."""
     sensors = [rows.sensor(o.noise) for o in null.model.plant.outputs.values()]
     change = _changes(null, drives, rows.block)
+    swing = {
+        j: float(np.nanstd(np.concatenate([d.y[:, j] for d in drives]))) for j in coordinates.by_output()
+    }
     return tuple(
-        grid(coordinates, ks, null.noise[j].sigma, _swing(drives, j), change[j], sensors[j], rows.block)
+        grid(coordinates, ks, null.noise[j].sigma, swing[j], change[j], sensors[j], rows.block)
         for j, ks in coordinates.by_output().items()
     )
 
@@ -307,12 +296,6 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
             )
     off = {output: max(errors, key=abs) for output, errors in contradictions.items()}
     return dataclasses.replace(plant, nodes=nodes), off, notes
-
-
-def _swing(drives: Sequence[Excitation], j: int) -> float:
-    """Root mean square of an output about its mean, over all recordings."""
-    values = np.concatenate([d.y[:, j] for d in drives])
-    return float(np.nanstd(values))
 
 
 def _without_outliers(

@@ -90,14 +90,13 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
 def quick(n: int) -> int:
     """Return the largest number up to n without a large prime factor, for a fast DCT."""
 
-    def rest(m: int) -> int:
-        """Return the factor of `m` without primes up to 31."""
+    def without_small_primes(m: int) -> int:
         for p in (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31):
             while m % p == 0:
                 m //= p
         return m
 
-    return next(m for m in range(n, 0, -1) if rest(m) == 1) if n > SHORT else n
+    return next(m for m in range(n, 0, -1) if without_small_primes(m) == 1) if n > SHORT else n
 
 
 def transform(c: Channel, e: np.ndarray) -> np.ndarray:

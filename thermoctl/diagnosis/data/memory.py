@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
@@ -26,8 +27,6 @@ from thermoctl.plant.language import Plant
 FILE = "memory.json"
 FORMAT = "thermoctl-memory/1"
 KEPT = 12  # number of likeliest hypotheses that are remembered, beside the plant without any effect
-
-Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -100,23 +99,19 @@ def write(folder: Path, plant: Plant, memory: Memory) -> None:
         "recordings": list(memory.recordings),
         "hypotheses": [
             {
+                **vars(h),
                 "effects": [
                     {
                         "effect": e.key[0],
                         "where": e.key[1],
                         "label": e.label,
-                        "values": dict(e.values),
-                        "ranges": {n: list(r) for n, r in e.ranges.items()},
+                        "values": e.values,
+                        "ranges": e.ranges,
                     }
                     for e in h.effects
                 ],
-                "unknowns": list(h.unknowns),
-                "spans": [list(r) for r in h.spans],
                 "z": h.z.tolist(),
                 "precision": h.precision.tolist(),
-                "log_evidence": h.log_evidence,
-                "squares": dict(h.squares),
-                "counts": dict(h.counts),
             }
             for h in memory.hypotheses
         ],

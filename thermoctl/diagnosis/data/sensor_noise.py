@@ -44,32 +44,35 @@ class _Powers:
     channel: Channel
     power: np.ndarray
 
+    def expected(self, noise: SensorNoise, step: float) -> np.ndarray:
+        """Return the variance of a row in each band. `step`: the variance of the rounding."""
+        return step + spectrum(noise, self.channel.frequency, self.channel.interval)
+
 
 def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
     """Return the plant with the noise of every output that was measured often enough. Raises InputError."""
     model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
     coordinates = Coordinates(drives)
-    counts = {
-        j: sum(len(coordinates.channels[k].index) for k in ks) for j, ks in coordinates.by_output().items()
-    }
-    if max(counts.values(), default=0) < LEAST:
+    channels, by_output = coordinates.channels, coordinates.by_output()
+    counts = {j: sum(len(channels[k].index) for k in ks) for j, ks in by_output.items()}
+    most = max(counts.values(), default=0)
+    if most < LEAST:
         raise InputError(
-            f"{', '.join(t.path for t in tables)}: too little data: at most {max(counts.values(), default=0)} measured "
-            f"values of one output; {LEAST} or more are needed to learn its noise"
+            f"{', '.join(t.path for t in tables)}: too little data: at most {most} measured values of one output; "
+            f"{LEAST} or more are needed to learn its noise"
         )
     refitted = fit(model, drives, default_noise(plant, drives), iterations=40, tolerance=1e-3, seconds=np.inf)
+    rows = [transform(c, refitted.residuals[c.recording][:, c.output]) for c in channels]
+    powers = [_Powers(c, p) for c, p in zip(channels, coordinates.powers(rows), strict=True)]
     outputs = dict(plant.outputs)
-    for j, ks in coordinates.by_output().items():
+    for j, ks in by_output.items():
         if counts[j] < LEAST:
             continue
-        channels = [coordinates.channels[k] for k in ks]
-        rows = [transform(c, refitted.residuals[c.recording][:, j]) for c in channels]
-        powers = [_Powers(c, np.bincount(c.band, x * x)) for c, x in zip(channels, rows, strict=True)]
         o = outputs[model.outputs[j]]
         # Variance of the rounding: the plant file states it as `resolution`, so it is no part of the noise.
         step = (o.resolution or 0.0) ** 2 / 12
-        outputs[o.name] = dataclasses.replace(o, noise=_best(powers, step))
+        outputs[o.name] = dataclasses.replace(o, noise=_best([powers[k] for k in ks], step))
     return dataclasses.replace(plant, outputs=outputs)
 
 
@@ -92,7 +95,9 @@ def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
             inside = noise.time is None or shortest < noise.time < longest
             tried.append((done.fun + 0.5 * len(start) * np.log(rows) + (0 if inside else np.inf), noise))
     best = min(tried, key=lambda x: x[0])[1]
-    scale = [_scale(p, best, step) for p in powers]
+    # by channel, the rms of the residual over that of the noise
+    ratios = (np.sum(p.power / p.expected(best, step)) / p.channel.count.sum() for p in powers)
+    scale = np.sqrt([*ratios])
     spread = float(np.var(np.log(scale)) if len(scale) > 1 else 0.0)
     # Of the logarithm: the variance of one estimate, and that from recording to recording.
     sd = np.sqrt(0.5 / rows + spread)
@@ -110,15 +115,9 @@ def _cost(x: np.ndarray, kind: str, powers: Sequence[_Powers], total: float, ste
     """Minus the log likelihood, up to a constant."""
     noise, cost = _made(kind, np.clip(x, -20.0, 20.0), total), 0.0
     for p in powers:
-        v = step + spectrum(noise, p.channel.frequency, p.channel.interval) + 1e-12 * total**2
+        v = p.expected(noise, step) + 1e-12 * total**2
         cost += 0.5 * float(np.sum(p.channel.count * np.log(v) + p.power / v))
     return cost
-
-
-def _scale(p: _Powers, noise: SensorNoise, step: float) -> float:
-    """Return the rms of a channel's residual, divided by that of a noise."""
-    v = step + spectrum(noise, p.channel.frequency, p.channel.interval)
-    return float(np.sqrt(np.sum(p.power / v) / p.channel.count.sum()))
 
 
 def command(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ENOUGH = 3  # from this number of recordings on, the last one is set aside
@@ -75,7 +75,7 @@ def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> W
         errors = {"before": [errors_aside(case, case.plant, t) for t in case.tables]}
         errors |= {"refit_only": _crossed(case, null), "after": _crossed(case, best)}
         lost = 0.0
-    before, refit_only, after = (_rms(e, null.fit.model) for e in errors.values())
+    before, refit_only, after = (rms_of(e, null.fit.model.outputs) for e in errors.values())
     names, tables = tuple(t.name for t in reserve), tuple(reserve or case.tables)
     return Worth(before, refit_only, after, bool(reserve), names, noise, lost, tables, errors)
 
@@ -98,11 +98,12 @@ def worse(alone: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
     return float(stdtr(len(blocks) - 1, mean / spread)) if spread > 0 else float(mean > 0)
 
 
-def _rms(errors: Sequence[np.ndarray], model: Model) -> dict[str, float]:
+def rms_of(errors: Sequence[np.ndarray], outputs: Sequence[str]) -> dict[str, float]:
+    """Return the root-mean-square error of each measured output, over all recordings."""
     joined = np.concatenate(errors)
     return {
         o: float(np.sqrt(np.nanmean(joined[:, j] ** 2)))
-        for j, o in enumerate(model.outputs)
+        for j, o in enumerate(outputs)
         if np.isfinite(joined[:, j]).any()
     }
 

@@ -17,7 +17,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.coordinates import Channel, transform
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
-from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.climb import Climbed, Spot, climb
@@ -39,7 +39,7 @@ class Placed:
     own: Mapping[str, str]  # by parameter of the effect, its name in the plant
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> Key:
         """Return (name of the effect, name of its place): the key of the placed effect."""
         return self.candidate.key
 
@@ -56,7 +56,7 @@ class Hypothesis:
     effects: tuple[Placed, ...] = ()
 
     @property
-    def keys(self) -> frozenset[tuple[str, str]]:
+    def keys(self) -> frozenset[Key]:
         """The key (effect, place) of each effect."""
         return frozenset(e.key for e in self.effects)
 
@@ -273,9 +273,8 @@ class Posterior:
             begin = 0
             for k in g.channels:
                 unknowns, x = by_band[k]
-                np.add.at(
-                    pull, np.ix_(g.node[begin : begin + len(x)], unknowns), x
-                )  # two bands may share a node
+                nodes = g.node[begin : begin + len(x)]
+                np.add.at(pull, np.ix_(nodes, unknowns), x)  # two bands may share a node
                 begin += len(x)
             out += pull.T @ unsure @ pull
         return out

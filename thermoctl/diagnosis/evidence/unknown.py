@@ -34,12 +34,11 @@ class Left:
 
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
-    names = [case.null.model.outputs[case.coordinates.channels[g.channels[0]].output] for g in case.grids]
-    over = dict(zip(names, over_noise(case, f), strict=True))
-    noise = dict(zip(names, levels(case, f), strict=True))
+    over = dict(zip(case.measured, over_noise(case, f), strict=True))
+    noise = dict(zip(case.measured, levels(case, f), strict=True))
     rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
-    worst = max(over, key=lambda o: over[o]) if over else ""
-    follow = follows(case, f, worst) if over and over[worst] > 1 else ()
+    worst = max(over, key=lambda o: over[o])
+    follow = follows(case, f, worst) if over[worst] > 1 else ()
     return Left(rms, noise, over, next(iter(located(case, f, reach)), None), follow)
 
 
@@ -74,7 +73,7 @@ def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
         values = signals(model, d, f.fit.values[r], model.run(d, f.fit.values[r], f.fit.dx0[r]).x)
         e = f.fit.residuals[r][:, j]
         for name in (*model.plant.inputs, *case.plant.nodes):
-            x = np.broadcast_to(np.asarray(values[name], float), d.t.shape)
+            x = np.asarray(values[name], float)
             for label, signal in ((name, x), (f"change of {name}", np.gradient(x, d.t))):
                 good = np.isfinite(e) & np.isfinite(signal)
                 a, b = e[good] - e[good].mean(), signal[good] - signal[good].mean()

@@ -111,17 +111,11 @@ def responses(
     ]
     size = [typical_flow(model.plant, n, trajectories) for n in nodes]
     for r, d in enumerate(drives):
-        forces, q = [], []
-        white_force = white_forces(len(d.t))
-        for i, n in enumerate(nodes):
-            storage = np.broadcast_to(
-                np.asarray(ex.evaluate(model.plant.nodes[n].storage, trajectories[r]), float), d.t.shape
-            )
-            for k in range(FORCES):
-                forces.append((model.states.index(n), i * FORCES + k))
-                q.append(white_force[:, k] * size[i] / storage)
-        count = len(nodes) * FORCES
-        dy = model.respond(d, values[r], dx0[r], forces, np.stack(q, axis=1), count) if count else None
+        storages = (ex.series(model.plant.nodes[n].storage, trajectories[r], d.t) for n in nodes)
+        force = white_forces(len(d.t))
+        q = [force * s / storage[:, None] for s, storage in zip(size, storages, strict=True)]
+        at = [(model.states.index(n), i * FORCES + k) for i, n in enumerate(nodes) for k in range(FORCES)]
+        dy = model.respond(d, values[r], dx0[r], at, np.concatenate(q, axis=1), len(at)) if at else None
         for k, c in enumerate(coordinates.channels):
             if c.recording != r:
                 continue

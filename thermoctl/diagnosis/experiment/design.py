@@ -66,6 +66,11 @@ class Excitation:
         return Table(name, name, t, columns)
 
 
+def recorded(tables: Sequence[Table], column: str) -> list[np.ndarray]:
+    """Return a column of each recording that has it."""
+    return [t.columns[column] for t in tables if column in t.columns]
+
+
 def levers(
     plant: Plant, tables: Sequence[Table], only: Sequence[str] = (), limits: Ranges = NONE
 ) -> list[Lever]:
@@ -77,15 +82,13 @@ def levers(
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
-    out: list[Lever] = []
-    series: list[np.ndarray] = []
+    out, series = list[Lever](), list[np.ndarray]()
     for i in plant.inputs.values():
-        if i.name not in only if only else i.unit and _of_surroundings(i.unit):
+        surroundings = i.unit and any(dimension(i.unit) == dimension(u) for u in SURROUNDINGS)
+        parts = recorded(tables, i.column)
+        if (i.name not in only if only else surroundings) or not _moved(parts):
             continue
-        parts = [t.columns[i.column] for t in tables if i.column in t.columns]
-        values = np.concatenate(parts) if parts else np.zeros(0)
-        if not _moved(values, parts):
-            continue
+        values = np.concatenate(parts)
         partner = next((k for k, other in enumerate(series) if _together(values, other)), None)
         if partner is None:
             out.append(_lever(i.name, i.column, tables, limits))
@@ -99,13 +102,9 @@ def levers(
     return out
 
 
-def _of_surroundings(unit: str) -> bool:
-    return any(dimension(unit) == dimension(u) for u in SURROUNDINGS)
-
-
-def _moved(values: np.ndarray, parts: Sequence[np.ndarray]) -> bool:
-    good = values[np.isfinite(values)]
-    return bool(len(good)) and any(np.nanstd(p) > 1e-6 * max(abs(good).max(), 1e-300) for p in parts)
+def _moved(parts: Sequence[np.ndarray]) -> bool:
+    largest = max((abs(v[np.isfinite(v)]).max(initial=0.0) for v in parts), default=0.0)
+    return any(np.nanstd(p) > 1e-6 * max(largest, 1e-300) for p in parts if np.isfinite(p).any())
 
 
 def _together(a: np.ndarray, b: np.ndarray) -> bool:
@@ -234,8 +233,7 @@ def _constant(
     for i in plant.inputs.values():
         if i.name in moved:
             continue
-        parts = [t.columns[i.column] for t in tables if i.column in t.columns]
-        parts = [p for p in parts if np.isfinite(p).any()]
+        parts = [p for p in recorded(tables, i.column) if np.isfinite(p).any()]
         means = [float(np.nanmean(p)) for p in parts]
         constant[i.name] = float(np.mean(means)) if means else 0.0
         if not means or not any(i.name in ex.names(n.initial) for n in plant.nodes.values()):
@@ -245,8 +243,7 @@ def _constant(
             low[i.name], high[i.name] = min(means), max(means)
     asked = {e.value for n in plant.nodes.values() for e in ex.walk(n.initial) if e.op == "first"}
     for o in plant.outputs.values():
-        parts = [t.columns[o.column] for t in tables if o.column in t.columns]
-        values = [p[np.isfinite(p)][0] for p in parts if np.isfinite(p).any()]
+        values = [p[np.isfinite(p)][0] for p in recorded(tables, o.column) if np.isfinite(p).any()]
         if o.name in asked and values:
             constant[o.name] = float(np.mean(values))
     return constant, [low, high] if low else [{}]

@@ -27,7 +27,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, with_residuals
-from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, family, levers
+from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, family, levers, recorded
 from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.law.result import described
@@ -46,16 +46,11 @@ FEWEST_POINTS = 150  # least number of samples of a simulated experiment with ma
 TRIALS, FEWEST_TRIALS = 150, 40  # number of candidates that are simulated: at most, and for large plants
 NUMBERS = 2e8  # largest number of slopes that all trials compute: a plant of many bodies gets fewer trials
 ENOUGH = 0.8  # share of the best experiment's bits that a shorter one must reach
-SHARES = (
-    1.0,
-    0.7,
-    0.5,
-    0.3,
-)  # shares of the inputs' recorded excursion from rest, tried until the readings stay inside their range
+# Shares of the inputs' recorded excursion from rest, tried until the readings stay inside their range.
+SHARES = (1.0, 0.7, 0.5, 0.3)
 DECIDES = 20.0  # least D that decides between two hypotheses: mean odds of e^(D/2)
-IN_RANGE = (
-    0.09  # variance of a parameter that is new in every recording: anything within its range (z from 0 to 1)
-)
+# Variance of a parameter that is new in every recording: anything within its range (z from 0 to 1).
+IN_RANGE = 0.09
 WORTH_A_SENSOR = 0.1  # least information in bits that a further sensor must add to be proposed
 
 Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
@@ -102,9 +97,8 @@ def _predictor(f: Fitted, weight: float, label: str) -> _Predictor:
     determined = [c for c, q in enumerate(model.unknowns) if q in place and slopes[c]]
     index = [place[model.unknowns[c]] for c in determined]
     scaled[np.ix_(determined, determined)] = covariance[np.ix_(index, index)]
-    scaled[np.diag_indices(nq)] = np.minimum(
-        np.diag(scaled), 1.0
-    )  # no parameter is more uncertain than its range
+    # no parameter is more uncertain than its range
+    scaled[np.diag_indices(nq)] = np.minimum(np.diag(scaled), 1.0)
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     return _Predictor(label, weight, model, root, slopes)
@@ -150,14 +144,12 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
         j = f.fit.model.outputs.index(o)
         r = [q[np.isfinite(q[:, j]), j] for q in f.fit.residuals]
         r = [q for q in r if len(q) > 8]
-        square = np.concatenate([q**2 for q in r]).mean() if r else n.sigma**2
-        lag = (
-            np.sum([np.sum(q[1:] * q[:-1]) for q in r]) / max(np.sum([np.sum(q**2) for q in r]), 1e-300)
-            if r
-            else 0.0
-        )
-        lag = float(np.clip(lag, 0.0, 0.98))
-        out.append(np.sqrt(max(square, n.sigma**2) * (1 + lag) / (1 - lag)))
+        square, lag = n.sigma**2, 0.0
+        if r:
+            square = max(square, np.concatenate([q**2 for q in r]).mean())
+            products, squares = np.sum([(np.sum(q[1:] * q[:-1]), np.sum(q**2)) for q in r], axis=0)
+            lag = float(np.clip(products / max(squares, 1e-300), 0.0, 0.98))
+        out.append(np.sqrt(square * (1 + lag) / (1 - lag)))
     return np.array(out)
 
 
@@ -176,14 +168,9 @@ def survivors(diagnosis: Diagnosis) -> list[Standing]:
             hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
         fits = {w.fitted.hypothesis.keys: w.fitted for w in diagnosis.searched.tried}
         likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
-    elif diagnosis.law:
-        likely = [
-            (f, share, described(p, f))
-            for p, f, share in (
-                (diagnosis.law.proposal, diagnosis.law.fitted, diagnosis.law.share),
-                *diagnosis.law.rivals,
-            )
-        ]
+    elif law := diagnosis.law:
+        laws = ((law.proposal, law.fitted, law.share), *law.rivals)
+        likely = [(f, share, described(p, f)) for p, f, share in laws]
     else:
         return []
     likely.sort(key=lambda x: -x[1])
@@ -202,11 +189,6 @@ class _Trial:
     bits: float
     distances: np.ndarray
     predictions: list[np.ndarray]  # readings (N, ny)
-
-    @property
-    def bits_per_second(self) -> float:
-        """Return the information per second of the experiment."""
-        return self.bits / self.excitation.duration_s
 
 
 class _Comparison:
@@ -301,7 +283,8 @@ def propose(
             trials = [t for t in pool.map(comparison.trial, candidates) if t is not None]
         if trials:
             most = max(t.bits for t in trials)
-            best = max((t for t in trials if t.bits >= ENOUGH * most), key=lambda t: t.bits_per_second)
+            enough = (t for t in trials if t.bits >= ENOUGH * most)
+            best = max(enough, key=lambda t: t.bits / t.excitation.duration_s)
             return _entry(comparison, best, len(trials)), best.excitation
     return None
 
@@ -348,8 +331,7 @@ def _smaller(lever: Lever, share: float) -> Lever:
 
 def _recorded(case: Case, j: int) -> np.ndarray:
     """Return all finite readings of output j, of all recordings."""
-    column = list(case.plant.outputs.values())[j].column
-    parts = [t.columns[column] for t in case.tables if column in t.columns]
+    parts = recorded(case.tables, list(case.plant.outputs.values())[j].column)
     return np.concatenate([p[np.isfinite(p)] for p in parts]) if parts else np.zeros(0)
 
 
@@ -376,21 +358,19 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
     table = best.excitation.table(plant, grid)
     predictions = [p for b in comparison.predictors if (p := b.predict(table, True)) is not None]
     shown = [plant.outputs[comparison.outputs[j]] for j in seen]
-    most, where = bits(best.distances, comparison.weights) + WORTH_A_SENSOR, ""
+    most, where = bits(best.distances, comparison.weights), ""
     for node in plant.nodes.values():
         same_unit = [sigma[j] for j, o in zip(seen, shown, strict=True) if o.unit == node.unit]
-        if (
-            any(o.value.op == "name" and o.value.value == node.name for o in shown)
-            or not same_unit
-            or any(node.name not in b.model.states for b in comparison.predictors)
-        ):
+        measured = any(o.value.op == "name" and o.value.value == node.name for o in shown)
+        known = all(node.name in b.model.states for b in comparison.predictors)
+        if measured or not same_unit or not known:
             continue
         noise = np.append(sigma[seen], np.median(same_unit)) * share
         with_sensor = bits(comparison.distances(predictions, noise, node.name), comparison.weights)
-        if with_sensor > most:
-            most, where = with_sensor + WORTH_A_SENSOR, node.name
+        if with_sensor > most + WORTH_A_SENSOR:
+            most, where = with_sensor, node.name
     if where:
-        return f"A sensor of its own at {where} would tell more ({most - WORTH_A_SENSOR:.2f} bits with the same experiment)."
+        return f"A sensor of its own at {where} would tell more ({most:.2f} bits with the same experiment)."
     return (
         f"No experiment of the family decides for sure between {comparison.predictors[0].label} and the others inside the "
         "recorded limits; a larger range of the inputs or another sensor would be needed."

@@ -10,16 +10,14 @@ from typing import Any
 from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.files.safe_file import write_text
 
-ROUNDS = 3
-
 
 def resolve(
     diagnosed: Callable[[Sequence[str]], dict[str, Any]],
     recordings: Sequence[str],
     out: Path,
     record: Callable[[Path, Path], None],
-    rounds: int = ROUNDS,
-    say: Callable[[str], None] = lambda text: None,
+    rounds: int,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Diagnose; while an experiment is proposed, run it and diagnose again, `rounds` times at most.
 

@@ -1,30 +1,96 @@
-"""Build a plant with an effect: apply the changes of a catalogue entry to the plant at a place."""
+"""An effect at a place, and the plant with it: the changes of a catalogue entry are applied to the plant."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.hypothesis.effect import UNITS_OF, EffectParameter
-from thermoctl.diagnosis.hypothesis.places import ERRORS, heats, outlet
-from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, TEMPERATURE, kind_of, zero_of
+from thermoctl.diagnosis.hypothesis.effect import UNITS_OF, Effect, EffectParameter
+from thermoctl.diagnosis.hypothesis.places import ERRORS, Place, heats, outlet
+from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
+from thermoctl.plant.fitting.residuals import Prior
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
-
-if TYPE_CHECKING:
-    from thermoctl.diagnosis.hypothesis.candidates import Candidate
 
 _form = cache(ex.parse)  # each expression of the catalogue is parsed once
 LONGEST = 78  # characters of a node's name
 
 
-class Builder:
+@dataclass
+class Candidate:
+    """An effect at a place, in one of its variants, with one choice of the signals that it needs.
+
+    `symbols`: these signals. `label`: of the variant and the choice."""
+
+    effect: Effect
+    place: Place
+    rig: Rig
+    variant: int = 0
+    symbols: Mapping[str, Expr] = field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Return (effect, place), the names in the result."""
+        return self.effect.name, self.place.where
+
+    def own(self, parameter: str) -> str:
+        """Return the name in the plant of one of the effect's parameters, or of a node that it adds."""
+        return f"{parameter}_{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
+
+    def own_in(self, plant: Plant) -> dict[str, str]:
+        """Return the names of those parameters of the effect that the plant has, by parameter."""
+        own = {p.name: self.own(p.name) for p in self.effect.parameters}
+        return {p: q for p, q in own.items() if q in plant.parameters}
+
+    @property
+    def reading(self) -> Output | Input | None:
+        """Return the output or recorded input at the place, None where it is none."""
+        plant, place = self.rig.plant, self.place
+        return plant.outputs.get(place.output or "") or plant.inputs.get(place.input or "")
+
+    def bounds(self, p: EffectParameter) -> tuple[float, float]:
+        """Return the physical bounds of a parameter, from the catalogue and the recordings."""
+        origin = self.rig.first_air(self.rig.drives[0]) if p.origin == "first_air" else 0.0
+        unit = self.rig.largest_jump(self.reading) if p.of == "jump" and self.reading else 1.0
+        return origin + unit * p.low, origin + unit * p.high
+
+    @property
+    def jumps(self) -> bool:
+        """Does the reading depend on held inputs, which change in steps?"""
+        y, inputs = self.place.symbols.get("y"), self.rig.plant.inputs
+        return y is not None and any(
+            i in self.rig.moving_inputs and not inputs[i].linear for i in ex.names(y)
+        )
+
+    def beliefs(self, plant: Plant) -> list[Prior]:
+        """Return the priors of the effect's parameters in `plant`, for each recording."""
+        if self.effect.prior is None:
+            return []
+        # a parameter that all recordings share has one prior, of which each recording gets an equal part
+        share = 1.0 if any(p.per_recording for p in self.effect.parameters) else 1.0 / len(self.rig.drives)
+        known, out = {p: name(q) for p, q in self.own_in(plant).items()}, []
+        for d in self.rig.drives:
+            recorded = {"duration": num(float(d.t[-1] - d.t[0])), "first_air": num(self.rig.first_air(d))}
+            prior = ex.fill(self.effect.prior, {**recorded, **known})
+            out.append(Prior(d.name, ex.mul(num(share), prior)))
+        return out
+
+    def extend(
+        self, values: Mapping[str, float], ranges: Mapping[str, tuple[float, float]] | None = None
+    ) -> Plant:
+        """Return the plant with the effect. `values`, `ranges`: by parameter of the effect."""
+        return _Builder(self, values, ranges or {}).plant()
+
+
+class _Builder:
     """The parts of a plant while the changes of an effect are applied to them.
 
     - `base`: the plant without the effect

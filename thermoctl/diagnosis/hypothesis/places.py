@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex
@@ -30,18 +31,9 @@ class Place:
         return {*self.nodes.values(), *named} | ({self.flow} if self.flow else set())
 
 
-def _nodes(rig: Rig, which: Sequence[str], symbol: str) -> Iterator[Place]:
+def _nodes(which: Iterable[str], symbol: str) -> Iterator[Place]:
     for n in which:
         yield Place(n, {symbol: name(n)}, {symbol: n})
-
-
-def _temperature_nodes(rig: Rig) -> Iterator[Place]:
-    if rig.air:
-        yield from _nodes(rig, rig.temperatures, "T")
-
-
-def _velocity_nodes(rig: Rig) -> Iterator[Place]:
-    yield from _nodes(rig, rig.velocities, "v")
 
 
 def _storing(rig: Rig) -> list[str]:
@@ -69,16 +61,13 @@ def _conductances(rig: Rig) -> Iterator[Place]:
 
 def _pairs(rig: Rig) -> Iterator[Place]:
     linked = {frozenset((f.source, f.target)) for f in rig.physics.flows.values()}
-    for k, a in enumerate(rig.temperatures):
-        for b in rig.temperatures[k + 1 :]:
-            if frozenset((a, b)) not in linked:
-                yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"TA": a, "TB": b})
+    for a, b in combinations(rig.temperatures, 2):
+        if frozenset((a, b)) not in linked:
+            yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"TA": a, "TB": b})
 
 
 def _heated_pairs(rig: Rig) -> Iterator[Place]:
-    for a in rig.temperatures:
-        if not heats(rig.physics, a, rig):
-            continue
+    for a in (a for a in rig.temperatures if heats(rig.physics, a, rig)):
         for b in rig.temperatures:
             if a != b:
                 yield Place(f"{a}-{b}", {"TA": name(a), "TB": name(b)}, {"a": a, "b": b})
@@ -104,14 +93,10 @@ def _rests(plant: Plant, f: Flow) -> bool:
     """Is a flow zero if all inputs are zero, at any temperatures?"""
     if any(e.op == "delay" for e in ex.walk(f.rate)):
         return False
-    values = {
-        **{p.name: p.value for p in plant.parameters.values()},
-        **dict.fromkeys(plant.inputs, 0.0),
-        "t": 0.0,
-    }
-    return all(
-        float(ex.evaluate(f.rate, {**values, **dict.fromkeys(plant.nodes, T)})) == 0 for T in (10.0, 60.0)
-    )
+    values = {p.name: p.value for p in plant.parameters.values()}
+    values |= dict.fromkeys([*plant.inputs, "t"], 0.0)
+    at = (values | dict.fromkeys(plant.nodes, temperature) for temperature in (10.0, 60.0))
+    return all(float(ex.evaluate(f.rate, v)) == 0 for v in at)
 
 
 def _joule_flows(rig: Rig) -> Iterator[Place]:
@@ -127,9 +112,8 @@ def _joule_flows(rig: Rig) -> Iterator[Place]:
 
 
 def _motors(rig: Rig) -> Iterator[Place]:
-    for f in rig.physics.flows.values():
-        if rig.is_motor(f):
-            yield Place(f.name, {}, {"v": f.target or f.source or ""}, flow=f.name)
+    for f in filter(rig.is_motor, rig.physics.flows.values()):
+        yield Place(f.name, {}, {"v": f.target or f.source or ""}, flow=f.name)
 
 
 def driven(rig: Rig) -> Iterator[Place]:
@@ -158,21 +142,16 @@ def _sensors(rig: Rig, dimension: str | None = None) -> Iterator[Place]:
             yield Place(i.name, {"y": name(i.name)}, input=i.name)
 
 
-def _of_bodies(rig: Rig) -> Iterator[Place]:
-    yield from (p for p in _sensors(rig) if p.where != rig.air)
-
-
 def _passive(rig: Rig) -> Iterator[Place]:
     """Yield sensors without driving inputs: the place `drive` is for delayed or clipped drives."""
     driving = {p.input for p in driven(rig)}
-    yield from (p for p in _sensors(rig) if not p.input or p.input not in driving)
+    yield from (p for p in _sensors(rig) if p.input is None or p.input not in driving)
 
 
 def _in_moving_air(rig: Rig) -> Iterator[Place]:
     if rig.air in rig.moving_inputs:
-        for p in (*_sensors(rig, "temperature"), *_displacements(rig)):
-            if p.where != rig.air:
-                yield p
+        places = (*_sensors(rig, "temperature"), *_displacements(rig))
+        yield from (p for p in places if p.where != rig.air)
 
 
 def _displacements(rig: Rig) -> Iterator[Place]:
@@ -190,14 +169,9 @@ def _members(rig: Rig) -> Iterator[Place]:
 
 def _bending_pairs(rig: Rig) -> Iterator[Place]:
     for displacement in _displacements(rig):
-        temperatures = rig.signals("T")
-        for k, a in enumerate(temperatures):
-            for b in temperatures[k + 1 :]:
-                yield Place(
-                    f"{a}-{b}",
-                    {**displacement.symbols, "TA": name(a), "TB": name(b)},
-                    output=displacement.output,
-                )
+        for a, b in combinations(rig.signals("T"), 2):
+            symbols = {**displacement.symbols, "TA": name(a), "TB": name(b)}
+            yield Place(f"{a}-{b}", symbols, output=displacement.output)
 
 
 def _voltages(rig: Rig) -> Iterator[Place]:
@@ -267,7 +241,7 @@ def _free(rig: Rig, e: Expr) -> bool:
 def _fixed_nodes(rig: Rig) -> Iterator[Place]:
     """Yield nodes whose storage has no free parameter, except a storage of 1: dn/dt = sum of flows."""
     storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
-    yield from _nodes(rig, [n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)], "T")
+    yield from _nodes((n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)), "T")
 
 
 def _fixed_flows(rig: Rig) -> Iterator[Place]:
@@ -282,10 +256,10 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")
 FAULTS = (*ERRORS, "reading_in_air")  # places that do not exist in a plant with `sensors: trusted`
 PLACES = {
-    "node": lambda rig: _nodes(rig, _storing(rig), "n"),
+    "node": lambda rig: _nodes(_storing(rig), "n"),
     "node_pair": _exchanging,
-    "temperature_node": _temperature_nodes,
-    "velocity_node": _velocity_nodes,
+    "temperature_node": lambda rig: _nodes(rig.temperatures if rig.air else (), "T"),
+    "velocity_node": lambda rig: _nodes(rig.velocities, "v"),
     "conductance": _conductances,
     "temperature_pair": _pairs,
     "heated_pair": _heated_pairs,
@@ -293,7 +267,7 @@ PLACES = {
     "motor": _motors,
     "drive": driven,
     "sensor": _sensors,
-    "body_sensor": _of_bodies,
+    "body_sensor": lambda rig: (p for p in _sensors(rig) if p.where != rig.air),
     "passive_sensor": _passive,
     "reading_in_air": _in_moving_air,
     "position_sensor": lambda rig: _sensors(rig, "length"),

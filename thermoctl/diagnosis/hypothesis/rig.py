@@ -216,7 +216,7 @@ class Rig:
     def signals(self, kind: str, near: str | None = None) -> list[str]:
         """Return names that can stand for v, x, i or T: nodes, inputs and unread columns.
 
-        `near`: the velocity whose signals are wanted. For T, also unread columns whose name suggests nothing."""
+        `near`: the velocity whose signals are wanted. For T, also unread columns without a guess."""
         p = self.physics
         if kind == "v":
             if near in self.velocities:

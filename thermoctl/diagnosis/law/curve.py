@@ -35,11 +35,8 @@ def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | 
         return None
     s = signals[0]
     parameters = {q: v.value for q, v in plant.parameters.items()}
-    values = [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
-    flows = [
-        np.broadcast_to(np.asarray(ex.evaluate(rate, {**run, **parameters}), float), d.t.shape)
-        for run, d in zip(linear.runs, linear.metric.drives, strict=True)
-    ]
+    values = linear.along(s.along)
+    flows = linear.along(lambda run, t: ex.series(rate, {**run, **parameters}, t))
     knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES + 4)))
     parts = [pieces(v, knots) for v in values]
     whole = np.concatenate(parts)

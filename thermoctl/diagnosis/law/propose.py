@@ -17,7 +17,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.unknown import located, reached
-from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.hypothesis.roles import Structure
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
@@ -168,12 +168,12 @@ def _along(linear: Tracked, t: Term) -> list[np.ndarray]:
     return [t.values(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
 
 
-def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
+def linearised(case: Case, parent: Fitted) -> tuple[Structure, list[Place], Tracked]:
     """Return the parts of a hypothesis' plant, the places of laws, and the plant about its recordings.
 
     Raises SimulationError."""
     drives = case.drives(parent.rough.model)
-    rig = Rig(parent.rough_plant, drives, [t.columns for t in case.tables])
+    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
     nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:

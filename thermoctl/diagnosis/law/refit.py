@@ -59,7 +59,7 @@ def refitted_law(
         c = law_candidate(rig, q)
         values, ranges = _start(q)
         plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
-        own = {name: c.own(name) for name in ranges if c.own(name) in plant.parameters}
+        own = {p: q for p, q in c.own_in(plant).items() if p in ranges}
         effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:
         return fitted(case, plant, effects, None, leader, parent)
@@ -118,7 +118,6 @@ def simpler_law(p: Proposal, f: Fitted) -> Proposal:
     c, values = f.hypothesis.effects[-1].candidate, f.plant.parameters
 
     def value(q: str) -> float:
-        """Return the fitted value of a parameter of the law."""
         return values[c.own(q)].value
 
     sizes = [[value(f"{q}{k}") for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,6 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
 from thermoctl.report.page import BLUE, FAINT, GREY, panel, panels, table, unit
-
-EVERY = "node"  # place of a law at a node that is neither a temperature nor a velocity
 
 
 def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
@@ -68,15 +66,10 @@ def _terms(p: Proposal) -> list[dict[str, Any]]:
 
 
 def _parameters(law: FoundLaw) -> dict[str, Any]:
-    c, plant = law.placed.candidate, law.fitted.plant
-    used = {q.name: c.own(q.name) for q in c.effect.parameters if c.own(q.name) in plant.parameters}
+    plant, sd = law.fitted.plant, law.fitted.sd
     return {
-        short: {
-            "value": plant.parameters[q].value,
-            "sd": law.fitted.sd.get(q),
-            "unit": plant.parameters[q].unit,
-        }
-        for short, q in used.items()
+        short: {"value": plant.parameters[q].value, "sd": sd.get(q), "unit": plant.parameters[q].unit}
+        for short, q in law.placed.candidate.own_in(plant).items()
     }
 
 
@@ -138,52 +131,50 @@ def _drawing(law: FoundLaw) -> str:
 def effect_file(law: FoundLaw) -> dict[str, Any]:
     """Return the content of an effect file. Its sizes are refitted, its shapes start at the fitted values."""
     c, plant = law.placed.candidate, law.fitted.plant
-    where, swap = _symbols(law, plant)
-    parameters: dict[str, Any] = {}
-    sizes = 0
-    for q in c.effect.parameters:
-        own = c.own(q.name)
-        p = plant.parameters.get(own)
-        if p is None:
-            continue
-        entry: dict[str, Any] = {"unit": p.unit} if p.unit else {}
-        if q.amplitude:
-            sizes += 1
-            entry["trial"] = "s" if sizes == 1 else f"s{sizes}"
-        else:
-            low, high = p.range or (p.value, p.value)
-            entry |= {
-                "unit": p.unit or "1",
-                "trial": repr(p.value),
-                "null": p.value,
-                "low": low,
-                "high": high,
-            }
-        parameters[q.name] = entry
-    changes = [_general(item, swap, _ends(where)) for item in c.effect.changes[0]]
-    variables = ", ".join(sorted({s.label for t in law.proposal.terms for s in t.signals}))
-    read = _names(changes)
-    needs = ["x"] if where == "velocity_node" and "x" in read else []
+    where, ends, symbols = _symbols(law, plant)
+    changes = [_general(item, symbols, ends) for item in c.effect.changes[0]]
+    rates = [what if isinstance(what, str) else what.get("rate", "0") for x in changes for what in x.values()]
+    read = set().union(*(ex.names(ex.parse(rate)) for rate in rates))
     reads = sorted(read & (plant.inputs.keys() | plant.nodes.keys()))
+    variables = ", ".join(sorted({s.label for t in law.proposal.terms for s in t.signals}))
     return {
         "effect": "law",
         "title": f"Law over {variables}, proposed from recordings",
         "where": where,
-        **({"needs": needs} if needs else {}),
+        **({"needs": ["x"]} if where == "velocity_node" and "x" in read else {}),
         **({"reads": reads} if reads else {}),
         "change": changes,
-        "parameters": parameters,
+        "parameters": _general_parameters(law),
         "excited_by": f"the visited range of {variables}",
         "source": f"thermoctl diagnose of {Path(plant.file).name}",
     }
 
 
-def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> dict[str, Any]:
+def _general_parameters(law: FoundLaw) -> dict[str, Any]:
+    """Return the parameters of an effect file: sizes with a trial value of s, s2 ..., and fitted shapes."""
+    c, out, sizes = law.placed.candidate, dict[str, Any](), 0
+    for q in c.effect.parameters:
+        p = law.fitted.plant.parameters.get(c.own(q.name))
+        if p is None:
+            continue
+        if q.amplitude:
+            sizes += 1
+            trial = "s" if sizes == 1 else f"s{sizes}"
+            out[q.name] = {**({"unit": p.unit} if p.unit else {}), "trial": trial}
+        else:
+            low, high = p.range or (p.value, p.value)
+            shape = {"trial": repr(p.value), "null": p.value, "low": low, "high": high}
+            out[q.name] = {"unit": p.unit or "1", **shape}
+    return out
+
+
+def _general(
+    change: Mapping[str, Any], symbols: Mapping[str, Expr], ends: Mapping[str, str]
+) -> dict[str, Any]:
     """Return a change of an effect with the symbols of an effect file."""
 
     def in_symbols(text: str) -> str:
-        """Return an expression with the symbols of an effect file."""
-        return str(ex.substitute(ex.parse(text), swap))
+        return str(ex.fill(ex.parse(text), symbols))
 
     ((kind, what),) = change.items()
     if isinstance(what, str):
@@ -192,49 +183,28 @@ def _general(change: Mapping[str, Any], swap: Any, ends: Mapping[str, str]) -> d
     return {kind: {k: ends.get(v, v) if k in ("into", "from") else v for k, v in out.items()}}
 
 
-def _names(changes: Sequence[Mapping[str, Any]]) -> set[str]:
-    rates = [what if isinstance(what, str) else what.get("rate", "0") for c in changes for what in c.values()]
-    return set().union(*(ex.names(ex.parse(r)) for r in rates))
+def _symbols(law: FoundLaw, plant: Plant) -> tuple[str, dict[str, str], dict[str, Expr]]:
+    """Return the kind of place, the ends of its flow, and the expression of each name of the plant.
 
-
-def _ends(where: str) -> dict[str, str]:
-    symbol = {"temperature_node": "T", "velocity_node": "v"}.get(where, "n")
-    return {"target": symbol, "source": "m"} if where == "node_pair" else {"target": symbol}
-
-
-def _symbols(law: FoundLaw, plant: Plant) -> tuple[str, Any]:
-    """Return the kind of place, and a function that puts symbols of an effect file for the plant's names."""
+    Ends and expressions are in the symbols of an effect file."""
     place, rig = law.proposal.place, law.placed.candidate.rig
-    target, symbols = place.target, dict[str, Expr]()
-    where = EVERY
+    target = place.target
     if place.source:
-        where, symbols = "node_pair", {target: name("n"), place.source: name("m")}
-    elif target in rig.temperatures and rig.air:
-        where = "temperature_node"
-        symbols = {
-            n: _celsius(name(s), u)
-            for n, s, u in (
-                (target, "T", plant.nodes[target].unit),
-                (rig.air, "air", _unit_of(plant, rig.air)),
-            )
-        }
-    elif target in rig.velocities:
-        where, symbols = "velocity_node", {target: name("v")}
-        if target in rig.position_of:
-            symbols[rig.position_of[target]] = name("x")
-    else:
-        symbols = {target: name("n")}
-    return where, lambda e: symbols.get(str(e.value)) if e.op == "name" else None
-
-
-def _celsius(e: Expr, its_unit: str | None) -> Expr:
-    zero = zero_of(its_unit)
-    return ex.add(e, num(zero)) if zero else e
-
-
-def _unit_of(plant: Plant, signal: str) -> str | None:
-    item = plant.inputs.get(signal) or plant.parameters.get(signal)
-    return item.unit if item else None
+        ends = {"target": "n", "source": "m"}
+        return "node_pair", ends, {target: name("n"), place.source: name("m")}
+    if target in rig.temperatures and rig.air:
+        air = plant.inputs.get(rig.air) or plant.parameters[rig.air]
+        of = {target: ("T", plant.nodes[target].unit), rig.air: ("air", air.unit)}
+        celsius = {n: ex.add(name(s), num(zero_of(its_unit))) for n, (s, its_unit) in of.items()}
+        return "temperature_node", {"target": "T"}, celsius
+    if target in rig.velocities:
+        position = rig.position_of.get(target)
+        return (
+            "velocity_node",
+            {"target": "v"},
+            {target: name("v"), **({position: name("x")} if position else {})},
+        )
+    return "node", {"target": "n"}, {target: name("n")}
 
 
 def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> Path:

@@ -63,7 +63,7 @@ class Signal:
 
     def along(self, run: Values, t: np.ndarray) -> np.ndarray:
         """Return its values (N,) along a trajectory."""
-        values = np.broadcast_to(np.asarray(ex.evaluate(self.value, run), float), t.shape)
+        values = ex.series(self.value, run, t)
         return values % self.size if self.daily else values
 
 

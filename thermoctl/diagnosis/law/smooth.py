@@ -23,9 +23,9 @@ from scipy.sparse import csr_matrix
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.posterior import FAR
-from thermoctl.diagnosis.evidence.where import SHARES, signals, typical_flow
+from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
-from thermoctl.diagnosis.law.signals import Place
+from thermoctl.diagnosis.law.signals import Place, Values
 from thermoctl.diagnosis.search.metric import Absorbed
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.plant import expression as ex
@@ -50,26 +50,43 @@ class Tracked:
 
     - `metric`: whitened rows at the trajectory, and the projection
     - `target` (rows,): the misfit that a law has to explain
-    - `runs`: by recording, every signal along the trajectory
-    - `duration`, `sample`: duration of the longest recording, and largest sampling interval, s
-    - `explained`: by node, the share of |target|^2 that a free flow in time into the node explains
-    - `free`: by node, the responses (rows, k) to such a flow, each knot's of typical size
+    - `free`: by node, the responses (rows, k) to a free flow in time into it, each knot's of typical size
     - `beyond`: directions that a free flow into another node absorbs, or None"""
 
     metric: Rows
     target: np.ndarray
-    runs: list[dict[str, np.ndarray | float]]
-    duration: float
-    sample: float
-    explained: dict[str, float]
     free: dict[str, np.ndarray]
     beyond: Absorbed | None = None
     _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+    @property
+    def runs(self) -> list[dict[str, np.ndarray | float]]:
+        """Return every signal along the trajectory, by recording."""
+        return self.metric.signals
+
+    @property
+    def duration(self) -> float:
+        """Return the duration of the longest recording, s."""
+        return max(float(d.t[-1]) for d in self.metric.drives)
+
+    @property
+    def sample(self) -> float:
+        """Return the largest sampling interval, s."""
+        return max(float(np.median(np.diff(d.t))) for d in self.metric.drives)
+
+    @cached_property
+    def explained(self) -> dict[str, float]:
+        """Return by node the share of |target|^2 that a free flow in time into it explains."""
+        return {n: _explained(x, self.target) for n, x in self.free.items()}
 
     @cached_property
     def above(self) -> Callable[[np.ndarray], float]:
         """Return a function of other rows: their log likelihood minus that of the target."""
         return self.metric.rise(self.target)
+
+    def along(self, values: Callable[[Values, np.ndarray], np.ndarray]) -> list[np.ndarray]:
+        """Return by recording what `values` gives for the signals along the trajectory, and their times."""
+        return [values(run, d.t) for run, d in zip(self.metric.signals, self.metric.drives, strict=True)]
 
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return the whitened, projected responses (rows, k) to flows (N, k), by recording, at a place.
@@ -95,14 +112,8 @@ class Tracked:
         x = np.concatenate([self.free[n] for n in nodes], axis=1)
         square, v = np.linalg.eigh(x.T @ x)
         square, force = np.maximum(square, 0.0), (v.T @ (x.T @ self.target)) ** 2
-
-        def score(share: float) -> float:
-            """Return the log marginal likelihood at a prior standard deviation."""
-            more = 1 + share**2 * square
-            return 0.5 * float(np.sum(force * share**2 / more - np.log(more)))
-
-        share = max(SHARES, key=score)
-        return score(share), float(share)
+        share = max(SHARES, key=lambda s: _gain(s, square, force))
+        return _gain(share, square, force), float(share)
 
     def beside(self, node: str, size: float) -> Tracked:
         """Return the linearised plant with a free flow of a prior size into a node."""
@@ -117,34 +128,37 @@ class Tracked:
         """Return the slope dx/dt of a node (N,) by recording, without the part of the unknown flow.
 
         With that part, a law of the storage could reproduce the unknown flow itself."""
-        out, storage = [], self.metric.model.plant.nodes[node].storage
-        for run, d in zip(self.runs, self.metric.drives, strict=True):
-            unknown = run.get(f"{LATENT}{node}", 0.0) / np.asarray(ex.evaluate(storage, run), float)
-            out.append(np.gradient(np.asarray(run[node], float), d.t) - unknown)
-        return out
+        storage = self.metric.model.plant.nodes[node].storage
+
+        def slope(run: Values, t: np.ndarray) -> np.ndarray:
+            unknown = run.get(f"{LATENT}{node}", 0.0) / ex.series(storage, run, t)
+            return np.asarray(np.gradient(np.asarray(run[node], float), t) - unknown)
+
+        return self.along(slope)
 
     def _unit(self, node: str) -> list[np.ndarray]:
         """Return, by recording, the rows of the responses to hat functions of flow into a node."""
         if node not in self._units:
-            self._units[node] = flow_rows(self.metric, self.runs, node, self._hats, 1.0)
+            self._units[node] = flow_rows(self.metric, node, self._hats)
         return self._units[node]
 
 
-def flow_rows(
-    metric: Rows,
-    runs: Sequence[dict[str, np.ndarray | float]],
-    node: str,
-    hats: Sequence[csr_matrix],
-    size: float,
-) -> list[np.ndarray]:
+def _gain(share: float, square: np.ndarray, force: np.ndarray) -> float:
+    """Return the log marginal likelihood of free flows, over that of none, at their prior sd `share`.
+
+    X (rows, k): responses to flows of unit sd; r: residual; X'X = V diag(square) V'; force = (V'X'r)^2."""
+    more = 1 + share**2 * square
+    return 0.5 * float(np.sum(force * share**2 / more - np.log(more)))
+
+
+def flow_rows(metric: Rows, node: str, hats: Sequence[csr_matrix], size: float = 1.0) -> list[np.ndarray]:
     """Return, by recording, the rows of the responses to flows into a node: hat functions times `size`.
 
     To save memory, TOGETHER responses are simulated at a time."""
     blocks, model = [], metric.model
     for r, (d, hat) in enumerate(zip(metric.drives, hats, strict=True)):
         parts, q = [], size * hat.toarray()
-        storage = np.asarray(ex.evaluate(model.plant.nodes[node].storage, runs[r]), float)
-        force = q / np.broadcast_to(storage, d.t.shape)[:, None]
+        force = q / ex.series(model.plant.nodes[node].storage, metric.signals[r], d.t)[:, None]
         for part in np.split(force, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
             k = part.shape[1]
             entries = [(model.states.index(node), j) for j in range(k)]
@@ -170,8 +184,7 @@ def _scaling(plant: Plant, node: str) -> ex.Expr:
     parameters, storage = plant.parameters, plant.nodes[node].storage
     if not ex.names(storage) & parameters.keys():
         return ex.ONE
-    now = ex.substitute(storage, lambda e: num(parameters[e.value].value) if e.value in parameters else None)
-    return ex.div(storage, now)
+    return ex.div(storage, ex.fill(storage, {q: num(p.value) for q, p in parameters.items()}))
 
 
 @dataclass(frozen=True)
@@ -182,7 +195,6 @@ class _Followed:
     - `wide`: by recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
 
     metric: Rows
-    runs: list[dict[str, np.ndarray | float]]
     misfit: list[np.ndarray]
     wide: list[np.ndarray]
 
@@ -217,20 +229,18 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
             metric = Rows(plain, average, False)
         except SimulationError:
             break
-        runs = [
-            signals(model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
-        ]
-        sizes = sizes or [typical_flow(plant, n, runs) or 1.0 for n in nodes]
+        sizes = sizes or [typical_flow(plant, n, metric.signals) or 1.0 for n in nodes]
         residual = [
             metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
         ]
         size = sum(float(e @ e) for e in residual)
         if best is not None and size >= best[0]:
             break
-        wide = _wide(metric, runs, nodes, sizes, hats)
+        by_node = [flow_rows(metric, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
+        wide = [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
         scaled = [(w / np.array(sizes)).T.ravel() for w in weights]
         misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
-        best = size, _Followed(metric, runs, misfit, wide)
+        best = size, _Followed(metric, misfit, wide)
         flows = _smoothed(wide, misfit, metric.own)
         weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in flows]
         left = [e - x @ p for e, x, p in zip(misfit, wide, flows, strict=True)]
@@ -266,12 +276,9 @@ def tracked(case: Case, f: Fitted, nodes: Sequence[str]) -> Tracked:
     """Track the recordings from a fitted hypothesis. Raises SimulationError."""
     followed = _followed(case, f, nodes)
     target = followed.metric.project(np.concatenate(followed.misfit))
-    duration = max(float(d.t[-1]) for d in followed.metric.drives)
-    sample = max(float(np.median(np.diff(d.t))) for d in followed.metric.drives)
     of_nodes = zip(*(np.split(x, len(nodes), axis=1) for x in followed.wide), strict=True)
     free = {n: followed.metric.project(block_diag(*x)) for n, x in zip(nodes, of_nodes, strict=True)}
-    explained = {n: _explained(x, target) for n, x in free.items()}
-    return Tracked(followed.metric, target, followed.runs, duration, sample, explained, free)
+    return Tracked(followed.metric, target, free)
 
 
 def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
@@ -279,7 +286,7 @@ def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
 
     `f`: the fitted plant. None where it cannot follow the recordings."""
     try:
-        runs = _followed(case, f, [node]).runs
+        runs = _followed(case, f, [node]).metric.signals
     except (SimulationError, np.linalg.LinAlgError):
         return None
     return float(np.sqrt(np.mean(np.concatenate([run[f"{LATENT}{node}"] for run in runs]) ** 2)))
@@ -299,9 +306,8 @@ def law_unit(plant: Plant, place: Place) -> str | None:
 
 
 def _explained(x: np.ndarray, target: np.ndarray) -> float:
-    square, v = np.linalg.eigh(
-        x.T @ x
-    )  # a decomposition of x itself costs seconds if it has thousands of columns
+    # a decomposition of x itself costs seconds if it has thousands of columns
+    square, v = np.linalg.eigh(x.T @ x)
     seen = square > ABSORBED**2 * square[-1]
     along = (v[:, seen].T @ (x.T @ target)) / np.sqrt(square[seen])
     return float(along @ along) / max(float(target @ target), 1e-300)
@@ -323,18 +329,6 @@ def _fitted_hats(hats: csr_matrix, flows: np.ndarray) -> np.ndarray:
     return solveh_banded(bands, hats.T @ np.nan_to_num(flows), check_finite=False)
 
 
-def _wide(
-    metric: Rows,
-    runs: Sequence[dict[str, np.ndarray | float]],
-    nodes: Sequence[str],
-    sizes: Sequence[float],
-    hats: Sequence[csr_matrix],
-) -> list[np.ndarray]:
-    """Return, by recording, the responses (rows, nodes * knots) to each knot's flow of typical size."""
-    by_node = [flow_rows(metric, runs, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
-    return [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
-
-
 def _smoothed(
     wide: Sequence[np.ndarray], targets: Sequence[np.ndarray], own: Sequence[Absorbed]
 ) -> list[np.ndarray]:
@@ -344,13 +338,8 @@ def _smoothed(
     each recording's own unknowns absorb."""
     parts = [np.linalg.svd(q.without(x), full_matrices=False) for q, x in zip(own, wide, strict=True)]
     along = [u.T @ q.without(e) for (u, _, _), q, e in zip(parts, own, targets, strict=True)]
-
-    def score(share: float) -> float:
-        """Return twice the log marginal likelihood at a prior standard deviation, up to a constant."""
-        variances = [1 + (share * s) ** 2 for _, s, _ in parts]
-        return sum(float(a**2 @ (1 - 1 / v) - np.log(v).sum()) for a, v in zip(along, variances, strict=True))
-
-    best = max(SHARES, key=score)
+    of = [(s**2, (s * a) ** 2) for (_, s, _), a in zip(parts, along, strict=True)]
+    best = max(SHARES, key=lambda share: sum(_gain(share, *x) for x in of))
     return [
         v.T @ (best**2 * s / (1 + (best * s) ** 2) * a) for (_, s, v), a in zip(parts, along, strict=True)
     ]

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from thermoctl.diagnosis.evidence.onsets import TIMES
+from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Excitation
@@ -14,61 +16,51 @@ from thermoctl.plant.simulation.simulate import Excitation
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor. A
 # second refit starts there, because an axis that sticks rests for a long time.
 STICKING = 300.0
+WEAK = 0.1
 
 
 def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
-    """Return the ranges of the effect's parameters in a refit: wide about the estimate, in their bounds."""
-    out = {}
-    for p in direction.candidate.effect.parameters:
-        value = direction.start[p.name]
-        kind = direction.candidate.effect.shapes.get(p.shape or "", "")
-        if p.shape in ("onset", "start", "end"):
-            if value <= duration:
-                out[p.name] = (0.0, duration)
-            continue
-        if p.shape == "phase":
-            out[p.name] = (-8.0, 8.0)
-            continue
-        if p.shape == "period":
-            out[p.name] = (
-                0.75 * value,
-                max(value, min(1.33 * value, direction.shape.get("longest", np.inf))),
-            )
-            continue
-        if p.shape == "level":
-            reach = max(abs(value), 1e-9)
-            out[p.name] = (
-                (max(p.low, value - 3 * reach), value + 3 * reach)
-                if kind != "small_levels"
-                else (0.0, 5 * reach)
-            )
-            continue
-        if p.shape:
-            least = STICKING if kind == "creep_speeds" else 30
-            out[p.name] = (
-                (max(p.low, value / least), min(p.high, value * 30))
-                if kind != "delays"
-                else (0.0, max(value * 8, 0.05 * duration))
-            )
-            continue
-        floor, ceiling = direction.candidate.bounds(p)
-        if np.isfinite(floor) and np.isfinite(ceiling):
-            out[p.name] = (floor, ceiling)
-            continue
-        reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
-        low, high = max(p.low, p.null - reach), min(p.high, p.null + reach)
-        if p.name == "C" and value > 0:
-            low, high = value / 100, value * 100
-        out[p.name] = (low, high)
-    return {n: (float(low), float(high)) for n, (low, high) in out.items()}
+    """Return the ranges of the effect's parameters in a refit: wide about the estimate, in their bounds.
+
+    The time of a jump after the recordings' end has none."""
+    ranges = {p.name: _range(direction, p, duration) for p in direction.candidate.effect.parameters}
+    return {n: (float(span[0]), float(span[1])) for n, span in ranges.items() if span}
 
 
-def weaker(direction: Direction, share: float = 0.1) -> Direction:
-    """Return the direction with a refit that starts at a `share` of its size."""
+def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[float, float] | None:
+    value = direction.start[p.name]
+    kind = direction.candidate.effect.shapes.get(p.shape or "", "")
+    if p.shape in TIMES:
+        return (0.0, duration) if value <= duration else None
+    if p.shape == "phase":
+        return -8.0, 8.0
+    if p.shape == "period":
+        return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
+    if p.shape == "level":
+        reach = max(abs(value), 1e-9)
+        if kind == "small_levels":
+            return 0.0, 5 * reach
+        return max(p.low, value - 3 * reach), value + 3 * reach
+    if kind == "delays":
+        return 0.0, max(value * 8, 0.05 * duration)
+    if p.shape:
+        least = STICKING if kind == "creep_speeds" else 30
+        return max(p.low, value / least), min(p.high, value * 30)
+    floor, ceiling = direction.candidate.bounds(p)
+    if np.isfinite(floor) and np.isfinite(ceiling):
+        return floor, ceiling
+    if p.name == "C" and value > 0:
+        return value / 100, value * 100
+    reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
+    return max(p.low, p.null - reach), min(p.high, p.null + reach)
+
+
+def weaker(direction: Direction) -> Direction:
+    """Return the direction with a refit that starts at the share WEAK of its size."""
     effect, start = direction.candidate.effect, dict(direction.start)
     for p in effect.parameters:
         if p.fades(effect.shapes):
-            start[p.name] = p.null + share * (start[p.name] - p.null)
+            start[p.name] = p.null + WEAK * (start[p.name] - p.null)
     return dataclasses.replace(direction, start=start)
 
 
@@ -98,8 +90,4 @@ def extend(base: Plant, direction: Direction, drives: Sequence[Excitation]) -> t
             value = float(np.clip(value, low + inside, high - inside))
         values[p.name] = value
     plant = direction.candidate.extend(values, ranges)
-    return plant, {
-        p.name: direction.candidate.own(p.name)
-        for p in direction.candidate.effect.parameters
-        if direction.candidate.own(p.name) in plant.parameters
-    }
+    return plant, direction.candidate.own_in(plant)

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.simulation.simulate import Excitation, Model, Simulation
 
@@ -44,6 +46,12 @@ class Metric:
     residual: np.ndarray
     own: list[Absorbed]
     shared: Absorbed
+
+    @cached_property
+    def signals(self) -> list[dict[str, np.ndarray | float]]:
+        """Return by recording every name of the plant with its value or its values (N,) along the run."""
+        runs = zip(self.drives, self.fit.values, self.runs, strict=True)
+        return [signals(self.model, d, values, run.x) for d, values, run in runs]
 
     def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
         """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""

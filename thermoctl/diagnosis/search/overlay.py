@@ -20,12 +20,8 @@ class Trajectory:
         self.recording, self.drive, self.run = r, d, run
         self.values: dict[str, np.ndarray | float] = {
             **{c: _hold(rig.columns[r][c]) for c in rig.spare},
-            **dict(zip(rig.plant.inputs, d.u.T, strict=False)),
             **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
-            **dict(zip(metric.model.parameters, map(float, metric.fit.values[r]), strict=True)),
-            **dict(zip(metric.model.states, run.x.T, strict=True)),
-            "t": d.t,
-            "pi": np.pi,
+            **metric.signals[r],
         }
         self.first = d.first
         self.known: dict[int, np.ndarray] = {}
@@ -44,9 +40,7 @@ class Trajectory:
 
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """Return the values (N,) of an expression along the trajectory. `extra`: further names."""
-        return np.broadcast_to(
-            np.asarray(ex.evaluate(e, {**self.values, **extra}), float), self.drive.t.shape
-        )
+        return ex.series(e, {**self.values, **extra}, self.drive.t)
 
 
 def _hold(column: np.ndarray) -> np.ndarray:
@@ -84,7 +78,7 @@ class Overlay:
 
         `values`: of the extension's parameters."""
         base = self.base
-        extra: dict[str, np.ndarray | float] = {k: v for k, v in values.items()}
+        extra: dict[str, np.ndarray | float] = dict(values)
         for n, net in self.new:
             extra[n.name] = _new_node(n, net, extra, trajectory)
         touched: dict[str, list[tuple[np.ndarray, float]]] = {}

@@ -116,9 +116,8 @@ def pairs(directions: Sequence[Direction], metric: Metric, limits: Thresholds) -
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
     g = np.maximum(v @ metric.residual, np.finfo(float).tiny)
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
-    first = (g[:, None] - c * g[None]) / (
-        1 - c**2
-    )  # size of the first beside the second, along its unit vector
+    # size of the first beside the second, along its unit vector
+    first = (g[:, None] - c * g[None]) / (1 - c**2)
     joint = g[:, None] * first + g[None] * first.T
     alone = np.array([d.gain for d in kept])
     extra = np.triu(joint - np.maximum.outer(alone, alone), 1)

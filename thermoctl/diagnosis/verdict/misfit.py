@@ -151,8 +151,9 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
     parts = []
-    for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
-        output = case.null.model.outputs[case.coordinates.channels[g.channels[0]].output]
+    for output, g, (own, coarse), p in zip(
+        case.measured, case.grids, noise, f.average.remainder, strict=True
+    ):
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
         rows = float(g.count.sum()) + f.past.counts.get(output, 0.0)
         square = power / (rows * own)

@@ -25,7 +25,7 @@ from scipy.special import expit, logsumexp
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_weighed
 from thermoctl.diagnosis.evidence.levels import rounded
-from thermoctl.diagnosis.evidence.where import signals, typical_flow, typical_rate
+from thermoctl.diagnosis.evidence.where import typical_flow, typical_rate
 from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
@@ -85,20 +85,15 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     Raises SimulationError."""
     f = as_weighed(f)
     metric = Rows(Plain(case, f, ROWS), f.average, True)
-    runs = [
-        signals(metric.model, d, metric.fit.values[r], metric.runs[r].x) for r, d in enumerate(metric.drives)
-    ]
-    knots = int(np.clip(TOGETHER // len(runs), FEWEST, KNOTS))
+    knots = int(np.clip(TOGETHER // len(metric.runs), FEWEST, KNOTS))
     hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
-    names = [case.coordinates.channels[g.channels[0]].output for g in case.grids]
-    coarse = {j for j, is_coarse in zip(names, rounded(case), strict=True) if is_coarse}
-    counts = np.concatenate(
-        [np.full(c.rows, c.output not in coarse) for c in metric.plain.coordinates.channels]
-    )
+    coarse = {name for name, is_coarse in zip(case.measured, rounded(case), strict=True) if is_coarse}
+    fine = [o not in coarse for o in case.null.model.outputs]
+    counts = np.concatenate([np.full(c.rows, fine[c.output]) for c in metric.plain.coordinates.channels])
     _, weight = metric.weighed(metric.residual)
-    responses = {n: block_diag(*flow_rows(metric, runs, n, hats, 1.0)) for n in nodes}
+    responses = {n: block_diag(*flow_rows(metric, n, hats)) for n in nodes}
     out = {}
-    for where, response, size in _ways(metric.model.plant, responses, runs):
+    for where, response, size in _ways(metric.model.plant, responses, metric.signals):
         x = metric.project(size * response) * counts[:, None]
         scores = [evidence(metric, x * share, weight)[0] for share in SHARES]
         gain = float(logsumexp(scores) - np.log(len(SHARES)))
