@@ -18,10 +18,22 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import refits
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.propose import Proposal, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.propose import Goal, Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import BEATEN, SURPLUS, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.diagnosis.search.beam import (
+    BEATEN,
+    NEAR,
+    SPREAD,
+    SURPLUS,
+    Search,
+    Searched,
+    Weighed,
+    grow,
+    searched,
+    swap,
+)
+from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -31,22 +43,25 @@ def with_laws(
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
-    No law is sought if the residual of the plant, or of one effect, is only noise. A law has smaller prior
-    odds than the effect and cannot fit better."""
+    No law is sought beside effects that leave only noise, nor if the plant leaves only noise and no effect
+    was found. What an effect leaves may be only noise by its size, and a law in its place fit far better."""
     best = result.tried[0].fitted
-    if len(best.hypothesis.effects) <= 1 and only_noise(case, best, limits):
+    if not best.hypothesis.effects and only_noise(case, best, limits):
         return result
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
     for parent in (s.tried[frozenset()], s.best):
-        if case.budget.stopped() or only_noise(case, parent.fitted, limits):
+        effects, quiet = parent.fitted.hypothesis.effects, only_noise(case, parent.fitted, limits)
+        if case.budget.stopped() or effects and quiet:
             continue
-        if len(parent.fitted.hypothesis.effects) >= limits.effects:
+        if len(effects) >= limits.effects:
             continue
         say("looking for a law")
-        laws = _laws(case, parent, s.tried[frozenset()], s.best.score, limits, say)
+        ahead = s.best.score - parent.score
+        goal = Goal(ahead - NEAR, SPREAD, NEAR, True) if quiet else Goal(ahead - BEATEN, HALF, 0.0, False)
+        laws = _laws(case, parent, s.tried[frozenset()], goal, limits, say)
         s.keep(laws)
         if s.best in laws:
             grow(s)
@@ -91,15 +106,15 @@ def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
 
 
 def _laws(
-    case: Case, parent: Weighed, alone: Weighed, ahead: float, limits: Thresholds, say: Callable[[str], None]
+    case: Case, parent: Weighed, alone: Weighed, goal: Goal, limits: Thresholds, say: Callable[[str], None]
 ) -> list[Weighed]:
     """Return a hypothesis with the best law at each place, beside a parent and beside the plant alone.
 
-    Only laws that may come near the score `ahead` are refitted.
+    Only laws that may reach the goal are refitted.
     The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
     them, too. There its promise is larger by what the effects gain."""
     try:
-        proposals, _ = propose_laws(case, parent.fitted, limits)
+        proposals = propose_laws(case, parent.fitted, limits, goal)
     except (SimulationError, np.linalg.LinAlgError):
         return []
     taken = {key[1] for key in parent.fitted.hypothesis.keys if key[0] == LAW}
@@ -107,7 +122,8 @@ def _laws(
 
     def refitted(base: Weighed, some: Sequence[Proposal]) -> list[tuple[Proposal, Weighed]]:
         """Return the laws that were refitted beside a hypothesis."""
-        tried = refits(case, base.fitted, some, ahead - BEATEN - base.score, say)
+        more = parent.score - base.score
+        tried = refits(case, base.fitted, some, replace(goal, least=goal.least + more), say)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
     groups = [(parent, refitted(parent, proposals))]

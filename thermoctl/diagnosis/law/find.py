@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.law.curve import Curve, curve
-from thermoctl.diagnosis.law.propose import Proposal
+from thermoctl.diagnosis.law.propose import Goal, Proposal
 from thermoctl.diagnosis.law.refit import (
     SIMPLER,
     PlacedLaw,
@@ -21,7 +21,6 @@ from thermoctl.diagnosis.law.refit import (
     simpler_law,
 )
 from thermoctl.diagnosis.law.smooth import law_unit, tracked
-from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, batches, each
 
@@ -79,21 +78,21 @@ def found_law(
 
 
 def refits(
-    case: Case, parent: Fitted, proposals: Sequence[Proposal], least: float, say: Callable[[str], None]
+    case: Case, parent: Fitted, proposals: Sequence[Proposal], goal: Goal, say: Callable[[str], None]
 ) -> list[Tried]:
     """Refit the proposals that may beat the best law so far.
 
     From the best sum, and from one with an insignificant term, the least significant term is left out.
-    `least`: log posterior odds that a law must reach. A promise is the first-order gain. All promises are
-    multiplied by the largest ratio so far of a refit's gain to its promise."""
+    All promises are multiplied by the largest ratio so far of a refit's gain to its promise."""
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
-    gain, ratio, leader, left = max(least, 0.0), 1.0, parent, affordable(case, parent)
+    goal, ratio = replace(goal, least=max(goal.least, 0.0)), 1.0
+    leader, left, ahead = parent, affordable(case, parent), goal.least
 
     def wanted(p: Proposal) -> bool:
         """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
-        if not left or case.budget.stopped() or p.cost + gain > HALF * ratio * p.promise:
+        if not left or case.budget.stopped() or not goal.reached(ratio * p.promise, p.cost):
             return False
         left -= 1
         return True
@@ -105,11 +104,13 @@ def refits(
             if f is None:
                 continue
             more_evidence = f.log_evidence - parent.log_evidence
-            gain, ratio = max(gain, more_evidence - p.cost), max(ratio, more_evidence / max(p.promise, 1.0))
+            ratio = max(ratio, more_evidence / max(p.promise, 1.0))
             leader = max(leader, f, key=lambda x: x.log_likelihood)
             if not f.absent and not at_bound(f):
                 tried.append((p, f))
-            best = more_evidence - p.cost >= gain
+            best = more_evidence - p.cost >= ahead
+            ahead = max(ahead, more_evidence - p.cost)
+            goal = replace(goal, least=max(goal.least, ahead - goal.near))
             if len(p.terms) > 1 and more and (f.doubtful or at_bound(f) or best):
                 simpler = simpler_law(p, f)
                 if simpler.kind not in {q.kind for q in queue}:

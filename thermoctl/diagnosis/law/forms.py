@@ -215,7 +215,12 @@ def families(
             out.append(Family(form, (), {}, duration, sample))
             continue
         for z in first:
-            fits = {"absolute": z.kelvin is not None, "position": z.position, "input": z.recorded}
+            fits = {
+                "absolute": z.kelvin is not None,
+                "position": z.position,
+                "input": z.recorded,
+                "loaded": z.drives,
+            }
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = _grid(form, z, duration)
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
@@ -224,9 +229,9 @@ def families(
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
     """Return the tuples of signals that a form may have with z as the first one."""
-    if form.of not in ("two", "driven"):
+    if form.of not in ("two", "driven", "loaded"):
         return [(z,)]
-    second = [w for w in every if w != z and not w.daily and (w.drives or form.of == "two")]
+    second = [w for w in every if w != z and not w.daily and (w.drives or form.of != "driven")]
     return [(z, w) for w in second if form.name != "product" or z.label < w.label]
 
 

@@ -39,11 +39,31 @@ GROWN = 8  # number of pairs, those with the best score, to which a third term i
 # Number of proposals in all; of those with one term, by score; of those with one term and different signals.
 PROPOSALS, SINGLE, SIGNALS = 14, 5, 4
 TERMS = 3
-ZOOMS, FINE = 2, 9  # number of finer grids of the shapes of a term; number of values of each shape in them
+# Number of terms whose shapes are searched more finely; of finer grids; of values of each shape in them.
+ZOOMED, ZOOMS, FINE = 20, 2, 9
 CHUNK = 256  # number of terms whose responses are computed at a time
 NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
 EACH, COUPLES = 8, 6  # number of terms of each law of a pair; number of pairs
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a law has to reach.
+
+    - `least`: log posterior odds against the hypothesis that it is added to
+    - `factor`: largest gain of a refit that is reckoned with, over its first-order promise
+    - `near`: nats below the best law so far, from which a law is not worth a refit
+    - `bounded`: does the gain of a free function bound that of a law? Far from the data it does not."""
+
+    least: float
+    factor: float
+    near: float
+    bounded: bool
+
+    def reached(self, promise: float, cost: float) -> bool:
+        """May a law of this promise reach it?"""
+        return self.factor * promise - cost >= self.least
 
 
 @dataclass(frozen=True)
@@ -64,9 +84,8 @@ class Proposal:
         Each term has the odds `missing` and `rare`, and is chosen from many places, signals and forms; a
         second signal adds one more choice. A flow that a difference or a velocity drives usually reverses
         with it: other terms have the prior `rare`."""
-        missing, rare = self.limits.missing, self.limits.rare
         chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
-        chosen -= len(self.terms) * float(np.log(missing / (1 - missing) * rare))
+        chosen += len(self.terms) * _unlikely(self.limits)
         return chosen + float(np.log(2)) * self.shapes + sum(self._form_cost(t) for t in self.terms)
 
     def _form_cost(self, t: Term) -> float:
@@ -92,6 +111,11 @@ class Proposal:
         return self.promise - self.cost
 
 
+def _unlikely(limits: Thresholds) -> float:
+    """Return minus the log of the prior odds of one term."""
+    return -float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """A term at a place: its gain in energy, and its responses (rows, sizes)."""
@@ -107,19 +131,24 @@ class Found:
         return self.term.form.name, self.term.signals
 
 
-def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> tuple[list[Proposal], Tracked]:
-    """Return the most promising laws, best first, and the linearised plant. Raises SimulationError."""
+def propose_laws(case: Case, parent: Fitted, limits: Thresholds, goal: Goal) -> list[Proposal]:
+    """Return the most promising laws, best first; none where no free function reaches the goal.
+
+    Raises SimulationError."""
     rig, where, linear = linearised(case, parent)
     likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
     combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, linear.runs)]
     free = _ranked(linear, combos)
-    pool = _terms(linear, free, COMBINATIONS)
     base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
+    most = max((gain for gain, *_ in free), default=-np.inf) + _knots_cost(linear, PIECES)
+    if goal.bounded and not goal.reached(most, base[0] + _unlikely(limits)):
+        return []
+    pool = _terms(linear, free, COMBINATIONS)
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(linear, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
-    return _mixed(out), linear
+    return _mixed(out)
 
 
 def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
@@ -130,7 +159,7 @@ def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: 
         every = [s for _, p, s in free if p == place][:SECOND]
         pool += _singles(linear, place, first, every)
     pool.sort(key=lambda f: -f.gain)
-    return sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool))], key=lambda f: -f.gain)
+    return sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])], key=lambda f: -f.gain)
 
 
 def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[Proposal, Proposal]]:
@@ -194,10 +223,15 @@ def _ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tup
         scored.append((_energy(x, linear.target), place, s, x))
     scored.sort(key=lambda f: -f[0])
     out = [
-        (_promise(linear, x)[0] - 0.5 * x.shape[1] * float(np.log(len(linear.target))), place, s)
+        (_promise(linear, x)[0] - _knots_cost(linear, x.shape[1]), place, s)
         for _, place, s, x in scored[:RANKED]
     ]
     return sorted(out, key=lambda f: -f[0])
+
+
+def _knots_cost(linear: Tracked, knots: int) -> float:
+    """Return the nats that the knots of a free function cost."""
+    return 0.5 * knots * float(np.log(len(linear.target)))
 
 
 def _energy(x: np.ndarray, target: np.ndarray) -> float:
