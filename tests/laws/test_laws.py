@@ -13,12 +13,13 @@ import yaml
 from tests.laws.prove import EQUAL, cases, difference
 from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
-from tests.plants import TWO_BLOCKS
+from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.experiment.propose import propose, survivors
 from thermoctl.diagnosis.hypothesis.candidates import candidates
@@ -277,6 +278,23 @@ def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
 def _named(table, count):
     rows = {k: v[:count] for k, v in table.columns.items()}
     return {"one": np.arange(count), "two": np.arange(count), "air": np.arange(count), **rows}
+
+
+def test_friction_that_grows_with_the_load_is_not_taken_for_dry_friction_that_leaves_only_noise():
+    plant, t = loads(SPRING_STAGE), np.arange(0, 15, 0.01)
+    gear = Flow("gear", ex.parse("1e-4 * abs(force) * tanh(velocity / 0.001)"), "velocity", None)
+    truth, tables = compile_plant(replace(plant, flows={**plant.flows, "gear": gear})), []
+    for k in (1, 2):
+        force = np.interp(t, np.arange(0, 16, 0.5), np.random.default_rng(k).uniform(-10, 10, 32))
+        tables.append(truth.measure(Table(f"run_{k}", "", t, {"force": force}), k))
+    d = diagnose(plant, tables, catalogue(), limits())
+    assert d.law and [(t.form.name, t.variables) for t in d.law.proposal.terms] == [
+        ("load_friction", {"velocity", "force"})
+    ]
+    friction = next(
+        w for w in d.searched.tried if w.fitted.hypothesis.keys == {("coulomb_friction", "velocity")}
+    )
+    assert only_noise(d.case, friction.fitted, limits()) and d.decision.named == (("law", "velocity"),)
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -44,29 +44,30 @@ def with_laws(
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     No law is sought beside effects that leave only noise, nor if the plant leaves only noise and no effect
-    was found. What an effect leaves may be only noise by its size, and a law in its place fit far better."""
-    best = result.tried[0].fitted
-    if not best.hypothesis.effects and only_noise(case, best, limits):
-        return result
+    was found. The size of a residual does not see tens of nats: a law may fit far better than the effect."""
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
+    alone = tried[frozenset()]
+    near = only_noise(case, alone.fitted, limits)
+    if near and result.tried[0] is alone:
+        return result
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
-    for parent in (s.tried[frozenset()], s.best):
-        effects, quiet = parent.fitted.hypothesis.effects, only_noise(case, parent.fitted, limits)
-        if case.budget.stopped() or effects and quiet:
+    for parent in (alone,) if s.best is alone else (alone, s.best):
+        if case.budget.stopped() or len(parent.fitted.hypothesis.effects) >= limits.effects:
             continue
-        if len(effects) >= limits.effects:
+        if parent is not alone and only_noise(case, parent.fitted, limits):
             continue
         say("looking for a law")
         ahead = s.best.score - parent.score
-        goal = Goal(ahead - NEAR, SPREAD, NEAR, True) if quiet else Goal(ahead - BEATEN, HALF, 0.0, False)
-        laws = _laws(case, parent, s.tried[frozenset()], goal, limits, say)
+        goal = Goal(ahead - NEAR, SPREAD, NEAR, True) if near else Goal(ahead - BEATEN, HALF, 0.0, False)
+        laws = _laws(case, parent, alone, goal, limits, say)
         s.keep(laws)
         if s.best in laws:
             grow(s)
             swap(s)
-    if not any(key[0] == LAW for key in s.best.fitted.hypothesis.keys) and not case.budget.stopped():
+    found = any(key[0] == LAW for key in s.best.fitted.hypothesis.keys)
+    if not near and not found and not case.budget.stopped():
         say("looking for laws at two places")
         pairs = _pairs(s, limits)
         s.keep(pairs)

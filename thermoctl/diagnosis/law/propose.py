@@ -54,7 +54,7 @@ class Goal:
     - `least`: log posterior odds against the hypothesis that it is added to
     - `factor`: largest gain of a refit that is reckoned with, over its first-order promise
     - `near`: nats below the best law so far, from which a law is not worth a refit
-    - `bounded`: does the gain of a free function bound that of a law? Far from the data it does not."""
+    - `bounded`: is the gain of a free function a bound of the laws' gains? It is near the data."""
 
     least: float
     factor: float
