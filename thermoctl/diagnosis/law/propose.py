@@ -49,12 +49,12 @@ KEPT = 20  # number of values of the shapes of a form over a signal that are kep
 
 @dataclass(frozen=True)
 class Goal:
-    """What a law has to reach.
+    """The odds that a law has to reach, and how far its promise is trusted.
 
     - `least`: log posterior odds against the hypothesis that it is added to
     - `factor`: largest gain of a refit that is reckoned with, over its first-order promise
     - `near`: nats below the best law so far, from which a law is not worth a refit
-    - `bounded`: is the gain of a free function a bound of the laws' gains? It is near the data."""
+    - `bounded`: the gain of a free function is a bound of the laws' gains, as it is near the data"""
 
     least: float
     factor: float
