@@ -55,6 +55,7 @@ def test_a_command_loads_nothing_that_it_does_not_use(command):
     [
         ("thermoctl", {"numpy", "thermoctl.api"}),
         ("thermoctl.api", {*SLOW, "scipy", "thermoctl.diagnosis.diagnose"}),
+        ("thermoctl.diagnosis.run", SLOW),
     ],
 )
 def test_an_import_loads_nothing_slow(module, forbidden):
