@@ -113,7 +113,7 @@ def plan(
 def _at_rest(plant: Plant, effects: Mapping[str, Effect], seen: set[Key]) -> list[Visible]:
     """Return the effects that have a place in the plant only while other inputs move."""
     placed = {c.key: c for c in candidates(made_rig(plant), effects) if sized(c.effect) and c.key not in seen}
-    return [Visible(c, "", None, np.inf, NOT_EXCITED) for c in placed.values()]
+    return [Visible(c, "", np.inf, NOT_EXCITED) for c in placed.values()]
 
 
 def _course(model: Model, limits: Ranges) -> Table:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 KOLMOGOROV = 1.358  # 95 % point of sqrt(n) times the largest deviation of a cumulated distribution
 NORMAL = 1.96  # 95 % point of a standard normal deviate, two-sided
 LAGS = 40  # at most
+POINTS = 400  # largest number of points of a curve: pixels of its panel
 LINE, BOUND, FAINT = "#0b6bcb", "#c7621b", "#d9d9d9"
 
 
@@ -41,10 +42,11 @@ def draw_autocorrelation(axes: Axes, e: np.ndarray) -> None:
 def draw_periodogram(axes: Axes, e: np.ndarray) -> None:
     """Draw the cumulated periodogram of residuals (N,) with its 95 % bounds."""
     f, share = cumulated_periodogram(e)
-    axes.plot(f, share, color=LINE)
+    shown = np.linspace(0, len(f) - 1, min(len(f), POINTS)).astype(int)
+    axes.plot(f[shown], share[shown], color=LINE)
     for side in (-1, 0, 1):
         bound = side * KOLMOGOROV / np.sqrt(len(f))
-        axes.plot(f, 2 * f + bound, color=BOUND, lw=0.8, ls="--" if side else ":")
+        axes.plot(f[[0, -1]], 2 * f[[0, -1]] + bound, color=BOUND, lw=0.8, ls="--" if side else ":")
     axes.set_ylim(0, 1)
     titled(axes, "cumulated periodogram", "frequency / sampling rate", "")
 

@@ -46,10 +46,17 @@ class Visible:
 
     candidate: Candidate
     parameter: str
-    unit: str | None
     smallest: float
     reason: str | None = None
     moves: tuple[str, float, float] | None = None
+
+    @property
+    def unit(self) -> str | None:
+        """The parameter's unit without needless brackets: K/s, not (K)/s."""
+        if not self.parameter:
+            return None
+        unit = self.candidate.extend({}).parameters[self.candidate.own(self.parameter)].unit
+        return re.sub(r"\(([^()*/ ]+)\)", r"\1", unit) if unit else unit
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of `not_seen` in diagnosis.json."""
@@ -150,9 +157,9 @@ def _visible(column: Column, full: float, left: float) -> Visible:
     c, _, (shape, dim), _ = column.item
     sizes = [p for p in c.effect.parameters if p.amplitude]
     if full < STILL:
-        return Visible(c, "", None, np.inf, NOT_EXCITED)
+        return Visible(c, "", np.inf, NOT_EXCITED)
     if left < ABSORBED * full:
-        return Visible(c, "", None, np.inf, IMITATED)
+        return Visible(c, "", np.inf, IMITATED)
     if sizes:
         absent = parameter_values(c, shape, [0.0 for _ in dim])
         values = parameter_values(c, shape, [SEEN / left * v for v in dim])
@@ -161,14 +168,8 @@ def _visible(column: Column, full: float, left: float) -> Visible:
             abs(values[p.name] - absent[p.name]),
             max(abs(np.array(c.bounds(p)) - absent[p.name])),
         )
-        return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if smallest > most else None)
+        return Visible(c, p.name, smallest, TOO_LARGE if smallest > most else None)
     # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
     p = next(p for p in c.effect.parameters if p.shape)
     smallest = column.item[2][0][str(p.shape)] * max(SEEN / left, 1 / NEAR)
-    return Visible(c, p.name, _unit(c, p.name), smallest, TOO_LARGE if left < SEEN else None)
-
-
-def _unit(c: Candidate, parameter: str) -> str | None:
-    """Return a parameter's unit without needless brackets: K/s, not (K)/s."""
-    unit = c.extend({}).parameters[c.own(parameter)].unit
-    return re.sub(r"\(([^()*/ ]+)\)", r"\1", unit) if unit else unit
+    return Visible(c, p.name, smallest, TOO_LARGE if left < SEEN else None)
