@@ -372,6 +372,11 @@ def _pushes(rng: np.random.Generator) -> list[Run]:
 
 _VDP, _XYZ, _LEVELS = ("x", "v"), ("x", "y", "z"), ("upper", "lower_level")
 _RABBITS = (3.1463924566781167, 1.5423300037202512)
+_COUNTED = (  # columns, noise and runs of both systems of predator and prey
+    {"x": "rabbits", "y": "wolves"},
+    lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
+    lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
+)
 SYSTEMS = (
     System(
         "Van der Pol",
@@ -420,9 +425,7 @@ SYSTEMS = (
             "wolves": lambda q, k: k * q["rabbits"] * q["wolves"],
         },
         {"rabbits": (0.9,), "wolves": (0.8,)},
-        {"x": "rabbits", "y": "wolves"},
-        lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
-        lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
+        *_COUNTED,
     ),
     System(
         "predator and prey, one term known",
@@ -431,9 +434,7 @@ SYSTEMS = (
         _populations,
         {"wolves": lambda q, k: k * q["rabbits"] * q["wolves"]},
         {"wolves": (0.8,)},
-        {"x": "rabbits", "y": "wolves"},
-        lambda x: {"x": 5e-3 * float(x["rabbits"].mean()), "y": 5e-3 * float(x["wolves"].mean())},
-        lambda rng: [Run(_times(5, 0.25), {}, _RABBITS), Run(_times(5, 0.25), {}, (2.0, 3.0))],
+        *_COUNTED,
     ),
     System(
         "bioreactor",

@@ -231,18 +231,15 @@ def doubts(case: Case, fit: Fit, noise: Mapping[str, float]) -> list[str]:
     model = fit.model
     drives = case.drives(model)
     recorded = np.concatenate([x.y for x in drives])
-    spread = {
-        o: float(np.nanquantile(recorded[:, j], 0.98) - np.nanquantile(recorded[:, j], 0.02))
-        for j, o in enumerate(model.outputs)
-        if np.isfinite(recorded[:, j]).any()
-    }
+    seen = {o: y[np.isfinite(y)] for o, y in zip(model.outputs, recorded.T, strict=True)}
+    spread = {o: float(np.ptp(np.quantile(y, (0.02, 0.98)))) for o, y in seen.items() if len(y)}
     moves = any(spread[o] > MOVES * s for o, s in noise.items())
     if not moves and not any(np.ptp(x.u, axis=0).any() for x in drives):
         return [
             "no input changes and no output moves: almost nothing is excited, so almost nothing could be seen; "
             "record a run with changing inputs"
         ]
-    swing = {o: float(np.nanstd(recorded[:, model.outputs.index(o)])) for o in spread}
+    swing = {o: float(np.std(seen[o])) for o in spread}
     return [
         f"the plant follows {o} only roughly (error {error:.3g}, standard deviation of the reading {swing[o]:.3g}): "
         "check that the recording is of this rig, in the plant's units, on one clock"
@@ -294,22 +291,21 @@ def _equation(after: Plant, e: Placed) -> str:
 def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
     if d.decision.verdict == "consistent":
         return []
-    rms = d.null.fit.rms()
-    entries = [
+    rms, noise, node = d.null.fit.rms(), d.before.noise, d.before.node
+    wrong = [o for o, ratio in d.before.over_noise.items() if ratio > MISFIT]
+    return [
         {
             "channel": o,
             "rms": rms[o],
-            "expected_rms": d.before.noise[o],
-            "node": d.before.node,
+            "expected_rms": noise[o],
+            "node": node,
             "missing_flow_rms": d.missing_flow,
-            "missing_flow_unit": flow_unit(d.case.plant, d.before.node) if d.before.node else None,
+            "missing_flow_unit": flow_unit(d.case.plant, node) if node else None,
             "when": _when(d, o),
             "follows": d.before.follows,
         }
-        for o, ratio in d.before.over_noise.items()
-        if ratio > MISFIT
+        for o in sorted(wrong, key=lambda o: -rms[o] / max(noise[o], 1e-300))
     ]
-    return sorted(entries, key=lambda m: -m["rms"] / max(m["expected_rms"], 1e-300))
 
 
 def _when(d: Diagnosis, output: str) -> list[list[float]]:
@@ -338,10 +334,9 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
 
     `physics`: each effect's probability of being physics; null if none stands out of the misfit.
     `remainder`: the largest probability of a remainder at an output."""
-    tried = d.searched.tried
-    null = next(w.fitted.log_evidence for w in tried if not w.fitted.hypothesis.effects)
+    null = next(w.fitted.log_evidence for w in d.searched.tried if not w.fitted.hypothesis.effects)
     out = []
-    for w in tried:
+    for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
         physics = d.physics.get(keys)
         out.append(

@@ -16,7 +16,7 @@ from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
 from thermoctl.diagnosis.data.grids import Grid, grid
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.progress import Pace
-from thermoctl.diagnosis.data.rows import OUTLIER, Reduced, reduced
+from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.yamlfile import InputError
@@ -24,7 +24,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.fitting.whitening import Noise
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
 from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant
 from thermoctl.recording.table import Table
@@ -186,7 +186,7 @@ def case(
     model = compile_plant(plant)
     drives = [model.excitation(t) for t in tables]
     _enough(model, drives, ", ".join(t.path for t in tables))
-    noise = fewer.noise(plant, drives)
+    noise = noise_of_means(plant, drives, fewer.block)
     rtol = _rtol(drives, noise)
     for d in drives:
         d.rtol = rtol
@@ -208,7 +208,7 @@ def case(
         noise,
         null,
         coordinates,
-        _grids(coordinates, drives, null, fewer),
+        _grids(coordinates, drives, null, fewer.block),
         budget,
         notes=[*freed, *averaged, *left_out, *guesses],
         block=fewer.block,
@@ -235,19 +235,17 @@ def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
     )
 
 
-def _grids(
-    coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, rows: Reduced
-) -> tuple[Grid, ...]:
-    """Return the frequency grid of each measured output."""
-    sensors = [rows.sensor(o.noise) for o in null.model.plant.outputs.values()]
-    change = _changes(null, drives, rows.block)
-    swing = {
-        j: float(np.nanstd(np.concatenate([d.y[:, j] for d in drives]))) for j in coordinates.by_output()
-    }
-    return tuple(
-        grid(coordinates, ks, null.noise[j].sigma, swing[j], change[j], sensors[j], rows.block)
-        for j, ks in coordinates.by_output().items()
-    )
+def _grids(coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, block: int) -> tuple[Grid, ...]:
+    """Return the frequency grid of each measured output, for rows that are means of `block` readings."""
+    out, change = [], _changes(null, drives, block)
+    outputs = list(null.model.plant.outputs.values())
+    for j, ks in coordinates.by_output().items():
+        stated, sensor = outputs[j].noise, None
+        if isinstance(stated, SensorNoise):
+            sensor = dataclasses.replace(stated, white=stated.white / np.sqrt(block))
+        swing = float(np.nanstd(np.concatenate([d.y[:, j] for d in drives])))
+        out.append(grid(coordinates, ks, null.noise[j].sigma, swing, change[j], sensor, block))
+    return tuple(out)
 
 
 def _changes(null: Fit, drives: Sequence[Excitation], block: int) -> np.ndarray:

@@ -66,51 +66,39 @@ GAP = 1.5  # a block that lasts so many times the usual duration lacks rows: it 
 
 @dataclass(frozen=True)
 class Reduced:
-    """Recordings with fewer rows. `block`: number of rows averaged to one; `before`, `after`: rows in all.
+    """Recordings with fewer rows. `block`: number of rows averaged to one; `before`: number of rows before.
 
     `z`: unknowns of a rough refit, where one was needed."""
 
     tables: list[Table]
     block: int
     before: int
-    after: int
     z: np.ndarray | None = None
-
-    def noise(self, plant: Plant, drives: Sequence[Excitation]) -> tuple[Noise, ...]:
-        """Return the noise of each output in the averaged rows."""
-        full = default_noise(plant, drives)
-        if self.block == 1:
-            return full
-        return tuple(
-            dataclasses.replace(n, sigma=_averaged_sd(n.sigma, o.noise, self.block)) if o.noise_sd else n
-            for n, o in zip(full, plant.outputs.values(), strict=True)
-        )
-
-    def sensor(self, noise: object) -> SensorNoise | None:
-        """Return the parts of a stated noise in the averaged rows; None if only a number is stated."""
-        if not isinstance(noise, SensorNoise):
-            return None
-        return dataclasses.replace(noise, white=noise.white / np.sqrt(self.block))
 
     @property
     def note(self) -> str:
         """Return a sentence for the result: how many rows were averaged to one."""
         return (
-            f"{self.after} of {self.before} rows were needed: means of {self.block} rows hold the same information; "
-            "noise and errors below are those of the means"
+            f"{sum(map(len, self.tables))} of {self.before} rows were needed: means of {self.block} rows hold the same "
+            "information; noise and errors below are those of the means"
         )
 
 
-def _averaged_sd(sigma: float, noise: object, block: int) -> float:
-    """Return the standard deviation of a mean of `block` values: only the white part becomes smaller."""
-    white = noise.white if isinstance(noise, SensorNoise) else sigma
-    return float(np.sqrt(max(sigma**2 - white**2 * (1 - 1 / block), 0.0)))
+def noise_of_means(plant: Plant, drives: Sequence[Excitation], block: int) -> tuple[Noise, ...]:
+    """Return the noise of each output in means of `block` rows: only the white part becomes smaller."""
+
+    def mean(n: Noise, stated: object) -> Noise:
+        white = stated.white if isinstance(stated, SensorNoise) else n.sigma
+        return dataclasses.replace(n, sigma=float(np.sqrt(max(n.sigma**2 - white**2 * (1 - 1 / block), 0.0))))
+
+    noise = zip(default_noise(plant, drives), plant.outputs.values(), strict=True)
+    return tuple(mean(n, o.noise) if block > 1 and o.noise_sd else n for n, o in noise)
 
 
 def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     """Return recordings with as few rows as hold the same information; the same ones if they are short."""
     before = sum(map(len, tables))
-    kept = Reduced(list(tables), 1, before, before)
+    kept = Reduced(list(tables), 1, before)
     if before <= LONG:
         return kept
     model = compile_plant(plant)
@@ -119,9 +107,8 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     )
     if coarse == 1:
         return kept
-    rough = Reduced([means(model, t, coarse) for t in tables], coarse, before, 0)
-    drives = [model.excitation(t) for t in rough.tables]
-    noise = rough.noise(plant, drives)
+    drives = [model.excitation(means(model, t, coarse)) for t in tables]
+    noise = noise_of_means(plant, drives, coarse)
     try:
         coarse_fit = fit(model, drives, noise, tolerance=1e-3, seconds=np.inf)
         chance = CHANCE / (len(tables) * len(model.outputs))
@@ -133,7 +120,7 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     if block == 1:
         return dataclasses.replace(kept, z=coarse_fit.z)
     out = [means(model, t, block, *start[:2]) for t, start in zip(tables, point, strict=True)]
-    return Reduced(out, block, before, sum(map(len, out)), coarse_fit.z)
+    return Reduced(out, block, before, coarse_fit.z)
 
 
 def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float) -> int:
@@ -175,7 +162,7 @@ def _bent(
     few = means(model, table, block, *start)
     d = model.excitation(few)
     change = model.run(d, *start).y - y[np.searchsorted(table.t, few.t)]
-    noise = Reduced([few], block, 0, 0).noise(model.plant, [model.excitation(table)])
+    noise = noise_of_means(model.plant, [model.excitation(table)], block)
     squares = np.where(np.isfinite(d.y), change / [n.sigma for n in noise], 0.0) ** 2
     return float(squares.sum(axis=0).max())
 

@@ -83,13 +83,10 @@ def levels(case: Case, f: Fitted) -> list[float]:
 
 def over_noise(case: Case, f: Fitted) -> list[float]:
     """Return the rms of each output's residuals over its noise (`levels`)."""
-    return [_rms(f, g) / level for g, level in zip(case.grids, levels(case, f), strict=True)]
+    squares = (sum(f.powers[k].sum() for k in g.channels) / g.count.sum() for g in case.grids)
+    return [float(np.sqrt(q)) / level for q, level in zip(squares, levels(case, f), strict=True)]
 
 
 def only_noise(case: Case, f: Fitted, limits: Thresholds) -> bool:
     """Is the residual about as large as the noise, and no remainder in it certain?"""
     return max(over_noise(case, f)) <= limits.clean and remainder(case, f) < limits.name
-
-
-def _rms(f: Fitted, g: Grid) -> float:
-    return float(np.sqrt(sum(f.powers[k].sum() for k in g.channels) / g.count.sum()))

@@ -146,7 +146,7 @@ def noise_of(case: Case, f: Fitted) -> np.ndarray:
         r = [q for q in r if len(q) > 8]
         square, lag = n.sigma**2, 0.0
         if r:
-            square = max(square, np.concatenate([q**2 for q in r]).mean())
+            square = max(square, float(np.concatenate([q**2 for q in r]).mean()))
             products, squares = np.sum([(np.sum(q[1:] * q[:-1]), np.sum(q**2)) for q in r], axis=0)
             lag = float(np.clip(products / max(squares, 1e-300), 0.0, 0.98))
         out.append(np.sqrt(square * (1 + lag) / (1 - lag)))

@@ -155,8 +155,10 @@ class _Builder:
         """Return the unit of a node, an input or a parameter; None for any other expression."""
         if e is None or e.op != "name":
             return None
-        tables = (self.base.nodes, self.base.inputs, self.base.parameters)
-        return next((table[e.value].unit for table in tables if e.value in table), None)
+        for table in (self.base.nodes, self.base.inputs, self.base.parameters):
+            if e.value in table:
+                return table[e.value].unit
+        return None
 
     def _unit(self, text: str | None) -> str | None:
         """Return the unit of a parameter; None where the plant does not state a unit that it depends on."""

@@ -160,49 +160,45 @@ def read(root: Node) -> Effect:
         raise top.get("effect").error(f"'{name}': a name of small letters, digits and '_' was expected")
     title, source = top.text("title"), top.text("source")
     excited_by, caution, contains = (top.text(key, "") for key in ("excited_by", "caution", "contains"))
-    mimics = top.list("mimics", required=False)
-    for node in mimics:
-        if not isinstance(node.value, str):
-            raise node.error("mimics: names of effects were expected")
-    needs = top.list("needs", required=False)
-    for node in needs:
-        if node.value not in NEEDS:
-            raise node.error(f"needs: one of {', '.join(NEEDS)} was expected, found {yamlfile.kind_of(node)}")
-    shapes = _shapes(top)
+    needs, mimics, reads = _names(top, "needs", NEEDS), _names(top, "mimics"), _names(top, "reads")
+    section = top.section("shapes", required=False)
+    shapes = {key: section.text(key, choices=SHAPES) for key in section.node.value} if section else {}
     sections = top.sections("parameters")
     given = {n for kind in shapes.values() for n in SHAPES[kind]}
     parameters = tuple(_parameter(q, p, given, sections) for q, p in sections.items())
-    amplitudes = max((_amplitudes(p.trial) for p in parameters), default=0)
-    dims = _dims(top, amplitudes)
-    reads = tuple(str(node.value) for node in top.list("reads", required=False))
-    symbols = {*SYMBOLS[where], *(str(n.value) for n in needs), *reads, *EVERYWHERE, *sections}
-    prior = top.given("prior")
+    dims = _dims(top, max((_amplitudes(p.trial) for p in parameters), default=0))
+    symbols = {*SYMBOLS[where], *needs, *reads, *EVERYWHERE, *sections}
     changes = _lists_of_changes(top, symbols, set(sections), where)
+    prior = top.given("prior")
     effect = Effect(
         name,
         title,
         where,
-        tuple(str(n.value) for n in needs),
+        needs,
         changes,
         shapes,
         parameters,
         dims,
         excited_by,
-        tuple(str(n.value) for n in mimics),
+        mimics,
         source,
-        caution or None,
-        _expression(prior, {*sections, "duration", "first_air"}, "prior") if prior else None,
-        contains or None,
-        reads,
+        caution=caution or None,
+        prior=_expression(prior, {*sections, "duration", "first_air"}, "prior") if prior else None,
+        contains=contains or None,
+        reads=reads,
     )
     top.end()
     return effect
 
 
-def _shapes(top: Section) -> dict[str, str]:
-    """Return the kind of each of the effect's shapes."""
-    section = top.section("shapes", required=False)
-    return {key: section.text(key, choices=SHAPES) for key in section.node.value} if section else {}
+def _names(top: Section, key: str, choices: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return a list of names, which may be left out."""
+    nodes = top.list(key, required=False)
+    for node in nodes:
+        if not isinstance(node.value, str) or choices and node.value not in choices:
+            expected = f"one of {', '.join(choices)}" if choices else "a name"
+            raise node.error(f"{key}: {expected} was expected, found {yamlfile.kind_of(node)}")
+    return tuple(str(node.value) for node in nodes)
 
 
 def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, Section]) -> EffectParameter:

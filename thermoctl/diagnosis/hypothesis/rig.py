@@ -154,7 +154,7 @@ class Rig:
         """Return the columns that move in every recording and are no part of the plant."""
         p = self.physics
         common = set.intersection(*(set(c) for c in self.columns)) if self.columns else set()
-        read = {q.column for table in (p.inputs, p.outputs) for q in table.values()}
+        read = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
         known = {*p.nodes, *p.parameters, *p.outputs, *p.inputs, *p.flows}
         return [
             c
@@ -232,9 +232,8 @@ class Rig:
             names += [n.name for n in p.nodes.values() if self.kind(n) == "length"]
             return (names or self.guessed("x"))[:3]
         if kind == "i":
-            names = [
-                q.name for table in (p.nodes, p.inputs) for q in table.values() if self.kind(q) == "current"
-            ]
+            quantities: list[Node | Input] = [*p.nodes.values(), *p.inputs.values()]
+            names = [q.name for q in quantities if self.kind(q) == "current"]
             return (names or self.guessed("i"))[:2]
         warm = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
         silent = (c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS))

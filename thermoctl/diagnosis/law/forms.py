@@ -52,11 +52,11 @@ class Form:
 
     name: str
     text: Expr
-    of: str
-    sizes: tuple[str, ...]
     shapes: Mapping[str, Shape]
-    memory: str | None
-    odd: bool  # does the term change its sign with its signal?
+    of: str = "any"
+    sizes: tuple[str, ...] = ("A",)
+    memory: str | None = None
+    odd: bool = False  # does the term change its sign with its signal?
     limit: str | None = None  # the form that it becomes at the upper bound of s, with the size A / s
 
 
@@ -67,31 +67,17 @@ def library() -> tuple[Form, ...]:
     for key, node in root.value.items():
         p: dict[str, Any] = node.plain()
         try:
-            text = ex.parse(p["text"])
+            p["text"] = ex.parse(p["text"])
         except ex.ExpressionError as e:
             raise node.error(str(e)) from None
-        shapes = {
-            k: Shape(
-                tuple(map(float, s["values"])),
-                (float(s["range"][0]), float(s["range"][1])),
-                s.get("unit"),
-                s.get("of"),
-            )
-            for k, s in p.get("shapes", {}).items()
-        }
-        out.append(
-            Form(
-                key,
-                text,
-                p.get("of", "any"),
-                tuple(p.get("sizes", ("A",))),
-                shapes,
-                p.get("memory"),
-                p.get("odd", False),
-                p.get("limit"),
-            )
-        )
+        p["shapes"] = {q: _shape(**s) for q, s in p.get("shapes", {}).items()}
+        p["sizes"] = tuple(p.get("sizes", Form.sizes))
+        out.append(Form(key, **p))
     return tuple(out)
+
+
+def _shape(values: Sequence[float], range: Sequence[float], **others: str) -> Shape:
+    return Shape(tuple(map(float, values)), (float(range[0]), float(range[1])), **others)
 
 
 @dataclass(frozen=True)
@@ -116,16 +102,12 @@ class Term:
 
     def expression(self, number: int) -> Expr:
         """Return the term with its parameters A, n, ... named A1, n1, ... and its signals filled in."""
-        own = {
-            q: name(f"{q}{number}")
-            for q in (*self.form.sizes, *self.form.shapes, *(("m",) if self.form.memory else ()))
-        }
-        symbols = dict(own)
-        for k, (symbol, s) in enumerate(zip("zw", self.signals, strict=False)):
-            symbols[symbol] = self.normal(s, f"{'ZW'[k]}{number}")
-            if s.kelvin is not None and symbol == "z":
-                symbols["T"] = ex.add(s.value, num(s.kelvin))
-        return ex.substitute(self.form.text, lambda e: symbols.get(str(e.value)) if e.op == "name" else None)
+        symbols = {q: name(f"{q}{number}") for q in (*self.form.sizes, *self.form.shapes, "m")}
+        for symbol, s in zip("zw", self.signals, strict=False):
+            symbols[symbol] = self.normal(s, f"{symbol.upper()}{number}")
+        if self.signals and self.signals[0].kelvin is not None:
+            symbols["T"] = ex.add(self.signals[0].value, num(self.signals[0].kelvin))
+        return ex.fill(self.form.text, symbols)
 
     @staticmethod
     def normal(s: Signal, scale: str) -> Expr:
@@ -135,10 +117,11 @@ class Term:
 
     def scales(self, number: int) -> dict[str, Signal]:
         """Return the fixed parameters Z1, W1 with the signals whose typical sizes they hold."""
-        used = ex.names(self.expression(number)) | (
-            ex.names(self.lagged(number)) if self.form.memory else set()
-        )
-        return {f"{'ZW'[k]}{number}": s for k, s in enumerate(self.signals) if f"{'ZW'[k]}{number}" in used}
+        used = ex.names(self.expression(number))
+        if self.form.memory:
+            used |= ex.names(self.lagged(number))
+        scales = zip((f"Z{number}", f"W{number}"), self.signals, strict=False)
+        return {scale: s for scale, s in scales if scale in used}
 
     def lagged(self, number: int) -> Expr:
         """Return the input of the term's memory: its first signal without unit."""
@@ -148,8 +131,7 @@ class Term:
         """Return the rate of change of the term's memory."""
         symbols = {k: name(f"{k}{number}") for k in ("m", *self.form.shapes)}
         symbols |= {"z": self.lagged(number), **{k: num(float(f"{v:.4g}")) for k, v in self.clock.items()}}
-        text = ex.parse(MEMORIES[self.form.memory or ""].rate)
-        return ex.substitute(text, lambda e: symbols.get(str(e.value)) if e.op == "name" else None)
+        return ex.fill(ex.parse(MEMORIES[self.form.memory or ""].rate), symbols)
 
     def memory_text(self, number: int) -> str:
         """Return the memory of the term in words."""
@@ -208,7 +190,9 @@ class Family:
 def families(
     first: Sequence[Signal], every: Sequence[Signal], duration: float, sample: float
 ) -> list[Family]:
-    """Return every form at its first values over each signal of `first`. `every`: possible second signals."""
+    """Return every form over each signal of `first`, at all combinations of its shapes' first values.
+
+    `every`: possible second signals."""
     out = []
     for form in library():
         if form.of == "none":
@@ -222,7 +206,7 @@ def families(
                 "loaded": z.drives,
             }
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
-                shapes = _grid(form, z, duration)
+                shapes = combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
     return [f for f in out if f.count]  # a signal with one value only has no two thresholds
 
@@ -233,11 +217,6 @@ def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal,
         return [(z,)]
     second = [w for w in every if w != z and not w.daily and (w.drives or form.of != "driven")]
     return [(z, w) for w in second if form.name != "product" or z.label < w.label]
-
-
-def _grid(form: Form, z: Signal, duration: float) -> dict[str, np.ndarray]:
-    """Return all combinations of the first values of the shapes."""
-    return combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
 
 
 def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:

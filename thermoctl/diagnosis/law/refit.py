@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import law_effect, library, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
@@ -58,8 +58,8 @@ def refitted_law(
         rig = Rig(plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
         c = law_candidate(rig, q)
         values, ranges = _start(q)
-        plant = c.extend({**{e.name: e.null for e in c.effect.parameters}, **values}, ranges)
-        own = {p: q for p, q in c.own_in(plant).items() if p in ranges}
+        plant = c.extend(values, ranges)
+        own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
         effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:
         return fitted(case, plant, effects, None, leader, parent)
@@ -74,7 +74,7 @@ def law_candidate(rig: Rig, p: Proposal) -> Candidate:
     return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
 
 
-def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Any:
+def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Effect:
     new = tuple(
         dataclasses.replace(q, low=ranges[q.name][0], high=ranges[q.name][1])
         if q.name in ranges and not q.amplitude
@@ -91,8 +91,7 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
     sizes = iter(p.sizes)
     for k, t in enumerate(p.terms, 1):
         for q in t.form.sizes:
-            v = next(sizes)
-            values[f"{q}{k}"] = v
+            values[f"{q}{k}"] = v = next(sizes)
             reach = RANGE * max(abs(v), 1e-300)
             ranges[f"{q}{k}"] = (-reach, reach)
         for q, shape in t.form.shapes.items():

@@ -81,24 +81,20 @@ class Overlay:
         extra: dict[str, np.ndarray | float] = dict(values)
         for n, net in self.new:
             extra[n.name] = _new_node(n, net, extra, trajectory)
-        touched: dict[str, list[tuple[np.ndarray, float]]] = {}
+        nets: dict[str, np.ndarray] = {}
         for f, old in self.flows:
             delta = trajectory.value(f.rate, extra) - (0.0 if old is None else trajectory.own(old.rate))
             for end, sign in ((f.source, -1.0), (f.target, 1.0)):
-                if end in base.nodes:
-                    touched.setdefault(end, []).append((delta, sign))  # type: ignore[arg-type]
-        slopes: dict[int, np.ndarray] = {}
-        for node, terms in touched.items():
-            total = sum(sign * delta for delta, sign in terms)
-            slopes[self.states.index(node)] = total / trajectory.own(base.nodes[node].storage)
+                if end and end in base.nodes:
+                    nets[end] = nets.get(end, 0.0) + sign * delta
+        slopes = {self.states.index(n): q / trajectory.own(base.nodes[n].storage) for n, q in nets.items()}
         for n, storage in self.storages:
             change = np.zeros(trajectory.drive.t.shape)
             for f in base.flows.values():
                 if n.name in (f.source, f.target):
                     change += (1.0 if f.target == n.name else -1.0) * trajectory.own(f.rate)
-            slopes[self.states.index(n.name)] = change / trajectory.value(
-                storage, extra
-            ) - change / trajectory.value(n.storage, extra)
+            before, after = (trajectory.value(e, extra) for e in (n.storage, storage))
+            slopes[self.states.index(n.name)] = change / after - change / before
         return slopes, {j: trajectory.value(new, extra) - trajectory.own(old) for j, old, new in self.outputs}
 
 
@@ -118,10 +114,7 @@ def _new_node(
 ) -> np.ndarray:
     """Integrate a new node alone along the trajectory: dn/dt = a - b n, a and b constant in a sample."""
     node = n.name
-    first = {
-        **{k: float(np.asarray(v).flat[0]) for k, v in trajectory.values.items()},
-        **{k: float(np.asarray(v).flat[0]) for k, v in extra.items()},
-    }
+    first = {k: float(np.asarray(v).flat[0]) for k, v in {**trajectory.values, **extra}.items()}
     start = float(ex.evaluate(n.initial, first, lambda key: trajectory.first[key]))
     t = trajectory.drive.t
     storage = trajectory.value(n.storage, extra)
@@ -130,11 +123,9 @@ def _new_node(
     if not a.any() and not b.any():
         return np.full(t.shape, start)
     h = np.diff(t)
-    before = (
-        trajectory.value(net, {**extra, **trajectory.until, node: 0.0}) / storage
-        if ex.names(net) & set(trajectory.until)
-        else a
-    )
+    before = a
+    if ex.names(net) & trajectory.until.keys():
+        before = trajectory.value(net, {**extra, **trajectory.until, node: 0.0}) / storage
     mid_a, mid_b = 0.5 * (before[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
     decay = np.exp(-mid_b * h)
     gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a
