@@ -59,15 +59,19 @@ def with_laws(
         if parent is not alone and only_noise(case, parent.fitted, limits):
             continue
         say("looking for a law")
-        ahead = s.best.score - parent.score
-        goal = Goal(ahead - NEAR, SPREAD, NEAR, True) if near else Goal(ahead - BEATEN, HALF, 0.0, False)
+        ahead, quiet = s.best.score - parent.score, only_noise(case, s.best.fitted, limits)
+        goal = (
+            Goal(ahead - NEAR, SPREAD, NEAR, True, True)
+            if near
+            else Goal(ahead - BEATEN, HALF, 0.0, quiet, False)
+        )
         laws = _laws(case, parent, alone, goal, limits, say)
         s.keep(laws)
         if s.best in laws:
             grow(s)
             swap(s)
     found = any(key[0] == LAW for key in s.best.fitted.hypothesis.keys)
-    if not near and not found and not case.budget.stopped():
+    if not found and not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
         say("looking for laws at two places")
         pairs = _pairs(s, limits)
         s.keep(pairs)

@@ -21,8 +21,11 @@ from thermoctl.diagnosis.law.refit import (
     simpler_law,
 )
 from thermoctl.diagnosis.law.smooth import law_unit, tracked
+from thermoctl.diagnosis.search.beam import SPREAD
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, batches, each
+
+SURE = 3  # number of refits
 
 Tried = tuple[Proposal, Fitted]
 
@@ -83,16 +86,20 @@ def refits(
     """Refit the proposals that may beat the best law so far.
 
     From the best sum, and from one with an insignificant term, the least significant term is left out.
-    All promises are multiplied by the largest ratio so far of a refit's gain to its promise."""
+    All promises are multiplied by the largest ratio so far of a refit's gain to its promise. Beside a best
+    hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
     tried: list[Tried] = []
     queue, more = list(proposals), SIMPLER
-    goal, ratio = replace(goal, least=max(goal.least, 0.0)), 1.0
+    goal, ratios = replace(goal, least=max(goal.least, 0.0)), list[float]()
     leader, left, ahead = parent, affordable(case, parent), goal.least
 
     def wanted(p: Proposal) -> bool:
         """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
-        if not left or case.budget.stopped() or not goal.reached(ratio * p.promise, p.cost):
+        sure = goal.quiet and len(ratios) >= SURE
+        trusted = replace(goal, factor=SPREAD) if sure else goal
+        ratio = max(ratios if sure else [1.0, *ratios])
+        if not left or case.budget.stopped() or not trusted.reached(ratio * p.promise, p.cost):
             return False
         left -= 1
         return True
@@ -104,7 +111,7 @@ def refits(
             if f is None:
                 continue
             more_evidence = f.log_evidence - parent.log_evidence
-            ratio = max(ratio, more_evidence / max(p.promise, 1.0))
+            ratios.append(more_evidence / max(p.promise, 1.0))
             leader = max(leader, f, key=lambda x: x.log_likelihood)
             if not f.absent and not at_bound(f):
                 tried.append((p, f))

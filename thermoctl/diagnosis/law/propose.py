@@ -54,11 +54,13 @@ class Goal:
     - `least`: log posterior odds against the hypothesis that it is added to
     - `factor`: largest gain of a refit that is reckoned with, over its first-order promise
     - `near`: nats below the best law so far, from which a law is not worth a refit
+    - `quiet`: the best hypothesis leaves only noise. Then a few refits tell how far promises are trusted
     - `bounded`: the gain of a free function is a bound of the laws' gains, as it is near the data"""
 
     least: float
     factor: float
     near: float
+    quiet: bool
     bounded: bool
 
     def reached(self, promise: float, cost: float) -> bool:
