@@ -16,15 +16,14 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
-from thermoctl.diagnosis.law.find import refits
+from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.propose import Goal, Proposal, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.propose import Proposal, pays, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (
     BEATEN,
     NEAR,
-    SPREAD,
     SURPLUS,
     Search,
     Searched,
@@ -33,7 +32,6 @@ from thermoctl.diagnosis.search.beam import (
     searched,
     swap,
 )
-from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -43,28 +41,24 @@ def with_laws(
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
-    No law is sought beside effects that leave only noise, nor if the plant leaves only noise and no effect
-    was found. The size of a residual does not see tens of nats: a law may fit far better than the effect."""
+    No law is sought if the plant leaves only noise and no effect was found. Nor is one if the best hypothesis
+    leaves only noise and no law is worth its odds there (`pays`). The size of a residual alone does not see
+    tens of nats, by which a law may fit better than the effect that imitates it."""
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
-    alone = tried[frozenset()]
-    near = only_noise(case, alone.fitted, limits)
-    if near and result.tried[0] is alone:
+    alone, best = tried[frozenset()], result.tried[0]
+    if only_noise(case, best.fitted, limits) and (best is alone or not _pays(case, best, limits)):
         return result
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
-    for parent in (alone,) if s.best is alone else (alone, s.best):
+    for parent in (alone,) if best is alone else (alone, best):
         if case.budget.stopped() or len(parent.fitted.hypothesis.effects) >= limits.effects:
             continue
         if parent is not alone and only_noise(case, parent.fitted, limits):
             continue
         say("looking for a law")
         ahead, quiet = s.best.score - parent.score, only_noise(case, s.best.fitted, limits)
-        goal = (
-            Goal(ahead - NEAR, SPREAD, NEAR, True, True)
-            if near
-            else Goal(ahead - BEATEN, HALF, 0.0, quiet, False)
-        )
+        goal = Goal(ahead - NEAR, NEAR, True) if quiet else Goal(ahead - BEATEN, 0.0, False)
         laws = _laws(case, parent, alone, goal, limits, say)
         s.keep(laws)
         if s.best in laws:
@@ -79,6 +73,13 @@ def with_laws(
             grow(s)
             swap(s)
     return searched(s)
+
+
+def _pays(case: Case, best: Weighed, limits: Thresholds) -> bool:
+    try:
+        return pays(case, best.fitted, limits)
+    except (SimulationError, np.linalg.LinAlgError):
+        return False
 
 
 def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
@@ -119,7 +120,7 @@ def _laws(
     The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
     them, too. There its promise is larger by what the effects gain."""
     try:
-        proposals = propose_laws(case, parent.fitted, limits, goal)
+        proposals = propose_laws(case, parent.fitted, limits)
     except (SimulationError, np.linalg.LinAlgError):
         return []
     taken = {key[1] for key in parent.fitted.hypothesis.keys if key[0] == LAW}

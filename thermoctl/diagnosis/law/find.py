@@ -9,7 +9,7 @@ from functools import partial
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.law.curve import Curve, curve
-from thermoctl.diagnosis.law.propose import Goal, Proposal
+from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import (
     SIMPLER,
     PlacedLaw,
@@ -22,10 +22,25 @@ from thermoctl.diagnosis.law.refit import (
 )
 from thermoctl.diagnosis.law.smooth import law_unit, tracked
 from thermoctl.diagnosis.search.beam import SPREAD
+from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, batches, each
 
 SURE = 3  # number of refits
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The odds that a law has to reach.
+
+    - `least`: log posterior odds against the hypothesis that it is added to
+    - `near`: nats below the best law so far, from which a law is not worth a refit
+    - `quiet`: the best hypothesis leaves only noise. Then a few refits tell how far promises are trusted"""
+
+    least: float
+    near: float
+    quiet: bool
+
 
 Tried = tuple[Proposal, Fitted]
 
@@ -97,9 +112,8 @@ def refits(
         """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
         sure = goal.quiet and len(ratios) >= SURE
-        trusted = replace(goal, factor=SPREAD) if sure else goal
-        ratio = max(ratios if sure else [1.0, *ratios])
-        if not left or case.budget.stopped() or not trusted.reached(ratio * p.promise, p.cost):
+        reach = SPREAD * max(ratios) if sure else HALF * max([1.0, *ratios])
+        if not left or case.budget.stopped() or p.cost + goal.least > reach * p.promise:
             return False
         left -= 1
         return True

@@ -22,6 +22,8 @@ from thermoctl.diagnosis.law.forms import Family, Term, combined, families, libr
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.search.beam import SPREAD
+from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -45,27 +47,6 @@ CHUNK = 256  # number of terms whose responses are computed at a time
 NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
 EACH, COUPLES = 8, 6  # number of terms of each law of a pair; number of pairs
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
-
-
-@dataclass(frozen=True)
-class Goal:
-    """The odds that a law has to reach, and how far its promise is trusted.
-
-    - `least`: log posterior odds against the hypothesis that it is added to
-    - `factor`: largest gain of a refit that is reckoned with, over its first-order promise
-    - `near`: nats below the best law so far, from which a law is not worth a refit
-    - `quiet`: the best hypothesis leaves only noise. Then a few refits tell how far promises are trusted
-    - `bounded`: the gain of a free function is a bound of the laws' gains, as it is near the data"""
-
-    least: float
-    factor: float
-    near: float
-    quiet: bool
-    bounded: bool
-
-    def reached(self, promise: float, cost: float) -> bool:
-        """May a law of this promise reach it?"""
-        return self.factor * promise - cost >= self.least
 
 
 @dataclass(frozen=True)
@@ -133,24 +114,54 @@ class Found:
         return self.term.form.name, self.term.signals
 
 
-def propose_laws(case: Case, parent: Fitted, limits: Thresholds, goal: Goal) -> list[Proposal]:
-    """Return the most promising laws, best first; none where no free function reaches the goal.
-
-    Raises SimulationError."""
+def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposal]:
+    """Return the most promising laws, best first. Raises SimulationError."""
     rig, where, linear = linearised(case, parent)
     likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
-    combos = [(p, s) for p in where if {*p.nodes} & {*likely} for s in signals(rig, p, linear.runs)]
-    free = _ranked(linear, combos)
-    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
-    most = max((gain for gain, *_ in free), default=-np.inf) + _knots_cost(linear, PIECES)
-    if goal.bounded and not goal.reached(most, base[0] + _unlikely(limits)):
-        return []
-    pool = _terms(linear, free, COMBINATIONS)
+    combos = _combos(rig, where, likely, linear)
+    pool = _terms(linear, _ranked(linear, combos), COMBINATIONS)
+    base = _look(combos), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(linear, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
     return _mixed(out)
+
+
+def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
+    """Return whether a law may be worth its odds beside a hypothesis that leaves only noise.
+
+    Where a law fits much better than the hypothesis, a free function of a signal gains something there. At a
+    velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
+    off the gain. Raises SimulationError."""
+    refitted = as_refitted(case, f)
+    metric = Rows(Plain(case, f, ROWS), refitted.average, True)
+    linear = Tracked(metric, metric.residual, {})
+    rig = Structure(f.rough_plant, metric.drives, [t.columns for t in case.tables])
+    where = places(rig)
+    nodes = [p.target for p in where if p == Place(p.target)]
+    if len(nodes) > NODES:
+        nodes = located(case, refitted, reached(case))[:NODES]
+    combos = _combos(rig, where, nodes, linear)
+    moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
+    both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
+    products = [(p, _along_both(linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
+    look, off = _look(combos), _cost_of(linear, PIECES) - _cost_of(linear, 2)
+    gains = [gain + off for gain, *_ in _ranked(linear, combos)[:1]]
+    gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
+    return SPREAD * max(gains, default=-np.inf) > look + _unlikely(limits)
+
+
+def _combos(
+    rig: Structure, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
+) -> list[tuple[Place, Signal]]:
+    """Return the places at some nodes, each with every signal that a law there may depend on."""
+    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.runs)]
+
+
+def _look(combos: Sequence[tuple[Place, Signal]]) -> float:
+    """Return the log of the number of places, signals and forms that a term is chosen from."""
+    return float(np.log(max(len(combos), 1)) + np.log(len(library())))
 
 
 def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
@@ -177,7 +188,7 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     if best is None or couples[best][0] < alone + NEEDED:
         return []
     combos = [(Place(n), s) for n in best for s in signals(rig, Place(n), linear.runs) if Place(n) in where]
-    base = float(np.log(max(len(combos), 1)) + np.log(len(library()))), limits
+    base = _look(combos), limits
     each = []
     for n, other in (best, best[::-1]):
         beside = linear.beside(other, couples[best][1])
@@ -213,27 +224,50 @@ def linearised(case: Case, parent: Fitted) -> tuple[Structure, list[Place], Trac
 
 
 def _ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
-    """Return the predicted gain of a free function of a signal at each place, the best first.
+    """Return the predicted gain of a free function of a signal at each place, the best first."""
+    gains = _gains(linear, [(p, _free(linear, s)) for p, s in combos])
+    return [(gain, *combos[k]) for gain, k in gains]
+
+
+def _gains(
+    linear: Tracked, functions: Sequence[tuple[Place, Sequence[np.ndarray]]]
+) -> list[tuple[float, int]]:
+    """Return the predicted gain of each free function at its place, and its position, the best first.
 
     Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
-    combinations with the largest gain in energy, and only these are returned."""
+    functions with the largest gain in energy, and only these are returned."""
     scored = []
-    for place, s in combos:
-        values = [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
-        knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
-        x = linear.columns(place, [pieces(v, knots) for v in values])
-        scored.append((_energy(x, linear.target), place, s, x))
+    for k, (place, flows) in enumerate(functions):
+        x = linear.columns(place, flows)
+        scored.append((_energy(x, linear.target), k, x))
     scored.sort(key=lambda f: -f[0])
-    out = [
-        (_promise(linear, x)[0] - _knots_cost(linear, x.shape[1]), place, s)
-        for _, place, s, x in scored[:RANKED]
-    ]
+    out = [(_promise(linear, x)[0] - _cost_of(linear, x.shape[1]), k) for _, k, x in scored[:RANKED]]
     return sorted(out, key=lambda f: -f[0])
 
 
-def _knots_cost(linear: Tracked, knots: int) -> float:
-    """Return the nats that the knots of a free function cost."""
-    return 0.5 * knots * float(np.log(len(linear.target)))
+def _free(linear: Tracked, s: Signal) -> list[np.ndarray]:
+    """Return the columns (N, knots) of a free function of a signal by recording."""
+    values = _values(linear, s)
+    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
+    return [pieces(v, knots) for v in values]
+
+
+def _values(linear: Tracked, s: Signal) -> list[np.ndarray]:
+    """Return the values (N,) of a signal by recording."""
+    return [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
+
+
+def _along_both(linear: Tracked, s: Signal, w: Signal) -> list[np.ndarray]:
+    """Return the columns of a free function of a signal times another one: its size, if the first drives."""
+    factors = _values(linear, w)
+    return [
+        x * (np.abs(f) if s.drives else f)[:, None] for x, f in zip(_free(linear, s), factors, strict=True)
+    ]
+
+
+def _cost_of(linear: Tracked, parameters: int) -> float:
+    """Return the nats that parameters cost: half the log of the number of rows each."""
+    return 0.5 * parameters * float(np.log(len(linear.target)))
 
 
 def _energy(x: np.ndarray, target: np.ndarray) -> float:
@@ -336,8 +370,7 @@ def _proposal(
 ) -> Proposal:
     promise, c = _promise(linear, x)
     p = Proposal(place, law, tuple(map(float, c)), promise, *base)
-    dims = len(c) + p.shapes
-    return dataclasses.replace(p, promise=promise - 0.5 * dims * float(np.log(len(linear.target))))
+    return dataclasses.replace(p, promise=promise - _cost_of(linear, len(c) + p.shapes))
 
 
 def _sums(
