@@ -31,7 +31,7 @@ from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, la
 from thermoctl.diagnosis.law.refit import law_of as placed_law
 from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect
 from thermoctl.diagnosis.law.signals import Place, Signal, signals
-from thermoctl.diagnosis.law.smooth import tracked
+from thermoctl.diagnosis.law.smooth import _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.plant import expression as ex
@@ -163,7 +163,8 @@ def test_parameters_that_scale_together_absorb_no_flow():
     made = make(next(law for law in LAWS if law.name == "thermostat"), "reactor", "small", "closed", 7)
     known = case(made.plant, made.tables[:2], {}, Budget(80))
     at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
-    assert at.explained["broth"] > 0.5 > at.explained["substrate"]
+    share = {n: _explained(x, at.target) for n, x in at.free.items()}
+    assert share["broth"] > 0.5 > share["substrate"]
 
 
 @pytest.mark.parametrize(("visited", "relays"), [((1.0, 1.0, 1.0), 0), ((0.0, 0.5, 1.0), 1)])

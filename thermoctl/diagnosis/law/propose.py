@@ -17,7 +17,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.unknown import located, reached
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
@@ -117,8 +117,7 @@ class Found:
 def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposal]:
     """Return the most promising laws, best first. Raises SimulationError."""
     rig, where, linear = linearised(case, parent)
-    likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
-    combos = _combos(rig, where, likely, linear)
+    combos = _combos(rig, where, linear.likely[:NODES], linear)
     pool = _terms(linear, _ranked(linear, combos), COMBINATIONS)
     base = _look(combos), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
@@ -137,7 +136,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     refitted = as_refitted(case, f)
     metric = Rows(Plain(case, f, ROWS), refitted.average, True)
     linear = Tracked(metric, metric.residual, {})
-    rig = Structure(f.rough_plant, metric.drives, [t.columns for t in case.tables])
+    rig = Rig(f.rough_plant, metric.drives, [t.columns for t in case.tables])
     where = places(rig)
     nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > NODES:
@@ -153,10 +152,10 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
 
 
 def _combos(
-    rig: Structure, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
+    rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
 ) -> list[tuple[Place, Signal]]:
     """Return the places at some nodes, each with every signal that a law there may depend on."""
-    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.runs)]
+    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.metric.signals)]
 
 
 def _look(combos: Sequence[tuple[Place, Signal]]) -> float:
@@ -181,13 +180,15 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     There is no pair if free flows into two nodes are less than NEEDED above those into one. Each law is
     proposed beside a free flow into the node of the other. Both laws state the promise of the pair."""
     rig, where, linear = linearised(case, parent)
-    likely = sorted(linear.explained, key=lambda n: -linear.explained[n])[:NODES]
+    likely = linear.likely[:NODES]
     couples = {(a, b): linear.flows((a, b)) for a, b in itertools.combinations(likely, 2)}
     alone = max(linear.flows((n,))[0] for n in likely)
     best = max(couples, key=lambda c: couples[c][0], default=None)
     if best is None or couples[best][0] < alone + NEEDED:
         return []
-    combos = [(Place(n), s) for n in best for s in signals(rig, Place(n), linear.runs) if Place(n) in where]
+    combos = [
+        (p, s) for n in best if (p := Place(n)) in where for s in signals(rig, p, linear.metric.signals)
+    ]
     base = _look(combos), limits
     each = []
     for n, other in (best, best[::-1]):
@@ -196,7 +197,7 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
         each.append([f for f in _varied(_terms(beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH])
     out = []
     for a, b in itertools.product(*each):
-        x = [linear.columns(f.place, _along(linear, f.term)) for f in (a, b)]
+        x = [linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)]
         promise, c = _promise(linear, np.concatenate(x, axis=1))
         laws = (
             Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
@@ -205,17 +206,12 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     return sorted(out, key=lambda p: p[0].cost + p[1].cost - p[0].promise)[:COUPLES]
 
 
-def _along(linear: Tracked, t: Term) -> list[np.ndarray]:
-    """Return the values (N, sizes) of a term by recording."""
-    return [t.values(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
-
-
-def linearised(case: Case, parent: Fitted) -> tuple[Structure, list[Place], Tracked]:
+def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
     """Return the parts of a hypothesis' plant, the places of laws, and the plant about its recordings.
 
     Raises SimulationError."""
     drives = case.drives(parent.rough.model)
-    rig = Structure(parent.rough_plant, drives, [t.columns for t in case.tables])
+    rig = Rig(parent.rough_plant, drives, [t.columns for t in case.tables])
     where = places(rig)
     nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:
@@ -247,19 +243,14 @@ def _gains(
 
 def _free(linear: Tracked, s: Signal) -> list[np.ndarray]:
     """Return the columns (N, knots) of a free function of a signal by recording."""
-    values = _values(linear, s)
+    values = linear.along(s.along)
     knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
     return [pieces(v, knots) for v in values]
 
 
-def _values(linear: Tracked, s: Signal) -> list[np.ndarray]:
-    """Return the values (N,) of a signal by recording."""
-    return [s.along(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)]
-
-
 def _along_both(linear: Tracked, s: Signal, w: Signal) -> list[np.ndarray]:
     """Return the columns of a free function of a signal times another one: its size, if the first drives."""
-    factors = _values(linear, w)
+    factors = linear.along(w.along)
     return [
         x * (np.abs(f) if s.drives else f)[:, None] for x, f in zip(_free(linear, s), factors, strict=True)
     ]
@@ -294,14 +285,13 @@ def _promise(linear: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
     """Return the terms at a place, the best KEPT of each form over each signal."""
-    still = linear.columns(place, [np.ones((len(d.t), 1)) for d in linear.metric.drives])
+    still = linear.columns(place, linear.along(lambda run, t: np.ones((len(t), 1))))
+    duration = max(float(d.t[-1]) for d in linear.metric.drives)
+    sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
-    for part in _chunks(families(first, every, linear.duration, linear.sample)):
-        flows = [
-            np.concatenate([f.values(run, d.t) for f in part], axis=1)
-            for run, d in zip(linear.runs, linear.metric.drives, strict=True)
-        ]
-        x = linear.columns(place, flows)
+    for part in _chunks(families(first, every, duration, sample)):
+        of_families = zip(*(linear.along(f.values) for f in part), strict=True)
+        x = linear.columns(place, [np.concatenate(q, axis=1) for q in of_families])
         ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
         for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
             out += _best(linear, place, f, own, still if f.signals else np.zeros_like(still))
@@ -342,10 +332,7 @@ def _zoomed(linear: Tracked, chosen: Found) -> Found:
     for _ in range(ZOOMS if grid else 0):
         grid = {q: _between(v, chosen.term.shapes[q]) for q, v in grid.items()}
         f = Family(t.form, t.signals, combined(grid), t.duration, t.sample)
-        x = linear.columns(
-            chosen.place,
-            [f.values(run, d.t) for run, d in zip(linear.runs, linear.metric.drives, strict=True)],
-        )
+        x = linear.columns(chosen.place, linear.along(f.values))
         best = _best(linear, chosen.place, f, x, np.zeros((len(x), 1)))[:1]
         chosen = max([chosen, *best], key=lambda b: b.gain)
     return chosen
@@ -445,13 +432,7 @@ def _mixed(proposals: Sequence[Proposal]) -> list[Proposal]:
     for p in single:
         if len(p.terms[0].signals) == 1:
             signal.setdefault((p.place, p.terms[0].signals), p)
-    chosen = [*proposals[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *proposals]
-    return _distinct(chosen)[:PROPOSALS]
-
-
-def _distinct(proposals: Sequence[Proposal]) -> list[Proposal]:
-    """Return proposals whose forms, signals or places differ."""
-    out: dict[Any, Proposal] = {}
-    for p in proposals:
-        out.setdefault(p.kind, p)
-    return list(out.values())
+    mixed: dict[Any, Proposal] = {}
+    for p in (*proposals[:1], *single[:SINGLE], *list(signal.values())[:SIGNALS], *proposals):
+        mixed.setdefault(p.kind, p)
+    return list(mixed.values())[:PROPOSALS]

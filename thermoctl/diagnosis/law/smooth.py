@@ -60,24 +60,10 @@ class Tracked:
     _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @property
-    def runs(self) -> list[dict[str, np.ndarray | float]]:
-        """Return every signal along the trajectory, by recording."""
-        return self.metric.signals
-
-    @property
-    def duration(self) -> float:
-        """Return the duration of the longest recording, s."""
-        return max(float(d.t[-1]) for d in self.metric.drives)
-
-    @property
-    def sample(self) -> float:
-        """Return the largest sampling interval, s."""
-        return max(float(np.median(np.diff(d.t))) for d in self.metric.drives)
-
-    @cached_property
-    def explained(self) -> dict[str, float]:
-        """Return by node the share of |target|^2 that a free flow in time into it explains."""
-        return {n: _explained(x, self.target) for n, x in self.free.items()}
+    def likely(self) -> list[str]:
+        """Return the nodes, sorted by the share of |target|^2 that a free flow in time into each explains."""
+        explained = {n: _explained(x, self.target) for n, x in self.free.items()}
+        return sorted(explained, key=lambda n: -explained[n])
 
     @cached_property
     def above(self) -> Callable[[np.ndarray], float]:
