@@ -15,7 +15,7 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.extend import extend, sticking, weaker
@@ -238,7 +238,7 @@ def remade(
     drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
     try:
         for e in effects:
-            found = candidates(Structure(plant, drives, columns), entries)
+            found = candidates(Rig(plant, drives, columns), entries)
             c = next(c for c in found if (c.key, c.label) == (e.key, e.label))
             inputs = plant.inputs.keys()
             plant = c.extend(e.values, e.ranges)
@@ -422,7 +422,7 @@ def _refitted(
     drives = looked.metric.drives
     try:
         for d in added:
-            rig = Structure(plant, drives, [t.columns for t in case.tables])
+            rig = Rig(plant, drives, [t.columns for t in case.tables])
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
             inputs = plant.inputs.keys()
             plant, own = extend(plant, d, drives)

@@ -15,7 +15,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.hypothesis.candidates import candidates
-from thermoctl.diagnosis.hypothesis.roles import Structure
+from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.fine import above, fine
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
@@ -224,7 +224,7 @@ class Screened:
     columns; empty where not all were simulated."""
 
     metric: Rows
-    rig: Structure
+    rig: Rig
     directions: list[Direction]
     promises: list[float]
     energy: Rows | None
@@ -242,7 +242,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     metric = Rows(plain, refitted.average, True)
     loud = max(over_noise(case, refitted)) > LOUD
     other = Rows(plain, refitted.average, False) if loud else None
-    rig = Structure(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
+    rig = Rig(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
     )
@@ -282,7 +282,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
 def places(case: Case) -> dict[str, set[str]]:
     """Return the places where each effect fits the plant. They share the effect's prior odds."""
     drives = case.drives(case.null.model)
-    rig = Structure(case.plant, drives, [t.columns for t in case.tables])
+    rig = Rig(case.plant, drives, [t.columns for t in case.tables])
     out: dict[str, set[str]] = {}
     for c in candidates(rig, case.catalogue):
         out.setdefault(c.effect.name, set()).add(c.place.where)
