@@ -273,7 +273,10 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
 def _equation(after: Plant, e: Placed) -> str:
     """Return the expression that the effect adds or changes, as text."""
     mine = set(e.own.values())
-    changed = (*(f.rate for f in reversed(after.flows.values())), *(o.value for o in after.outputs.values()))
+    changed = (
+        *(f.rate for f in reversed(tuple(after.flows.values()))),
+        *(o.value for o in after.outputs.values()),
+    )
     for expression in changed:
         if ex.names(expression) & mine:
             return str(expression)

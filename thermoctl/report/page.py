@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,9 +136,9 @@ def panel(width: float = HALF) -> Axes:
 def panels(every: Sequence[Axes], caption: str) -> str:
     """Return panels as inline SVG, side by side where there is room, below the legend of the first."""
     lines = zip(*every[0].get_legend_handles_labels(), strict=True)
-    legend = "".join(_legend(line, label) for line, label in lines)
+    legend = "".join(_legend(cast("Line2D", line), label) for line, label in lines)
     _make_room(every)
-    drawn = "".join(_svg(axes.figure) for axes in every)
+    drawn = "".join(_svg(cast("Figure", axes.figure)) for axes in every)
     return _captioned(f'<p class="legend">{legend}</p><div class="panels">{drawn}</div>', caption)
 
 
@@ -148,8 +148,8 @@ def _captioned(body: str, caption: str) -> str:
 
 def _legend(line: Line2D, label: str) -> str:
     """Return a line's label beside a piece of the line."""
-    kind = {"--": "dashed", "None": "dotted"}.get(line.get_linestyle(), "solid")
-    style = f"border-top:{max(line.get_linewidth(), 1)}pt {kind} {_themed(line.get_color())}"
+    kind = {"--": "dashed", "None": "dotted"}.get(str(line.get_linestyle()), "solid")
+    style = f"border-top:{max(line.get_linewidth(), 1)}pt {kind} {_themed(str(line.get_color()))}"
     return f'<span><i style="{style}"></i>{html.escape(label)}</span>'
 
 
@@ -158,11 +158,11 @@ def _make_room(every: Sequence[Axes]) -> None:
     letters = 0
     for axes in every:
         axes.locator_params(nbins=TICKS)
-        numbers = axes.yaxis.get_major_formatter().format_ticks(axes.yaxis.get_majorticklocs())
+        numbers = axes.yaxis.get_major_formatter().format_ticks(list(axes.yaxis.get_majorticklocs()))
         letters = max(letters, *map(len, numbers))
     left, low, high = LETTER * letters + 1.5 * LINE, 2.3 * LINE, HEIGHT - 3.6 * LINE
     for axes in every:
-        whole = axes.figure.get_figwidth()
+        whole = cast("Figure", axes.figure).get_figwidth()
         width = whole - left - LINE
         axes.set_position((left / whole, low / HEIGHT, width / whole, high / HEIGHT))
         axes.yaxis.set_label_coords((0.7 * LINE - left) / width, 0.5)
