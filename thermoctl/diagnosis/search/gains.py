@@ -30,7 +30,6 @@ class Direction:
     dims: int
     start: dict[str, float]
     vector: np.ndarray | None = None  # unit vector of the projected direction
-    excited: float = 0.0  # norm of the direction after projection, over its norm before
     elsewhere: float = 0.0  # log10 of the number of shapes from which the residual itself picked this one
 
     @property
@@ -153,12 +152,7 @@ def score(
     if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
         gain = 0.0
     shape, s = _sizes(c, columns, shape, coefficient)
-    _keep(
-        best,
-        Direction(c, shape, gain, int(useful.sum()), {}, None, float(left[useful].max())),
-        s,
-        lambda: rows @ coefficient,
-    )
+    _keep(best, Direction(c, shape, gain, int(useful.sum()), {}), s, lambda: rows @ coefficient)
 
 
 def _plausible(
@@ -263,8 +257,7 @@ def _score_windows(
         gain = g[a] ** 2 / m[a, a]
     shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
     vector = rows[:, a] - (rows[:, b] if b < last else 0)
-    excited = float(np.linalg.norm(vector)) / max(full[a], 1e-300)
-    _keep(best, Direction(c, shape, gain, 1, {}, None, excited), [amplitude], lambda: vector)
+    _keep(best, Direction(c, shape, gain, 1, {}), [amplitude], lambda: vector)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:
