@@ -113,6 +113,7 @@ def diagnose(args: argparse.Namespace) -> int:
         )
 
     def diagnosed(recordings: Sequence[str]) -> dict[str, Any]:
+        """Diagnose the recordings of the command line, and those that --resolve has recorded since."""
         added = read_recordings(plant, recordings[len(args.recordings) :])  # recordings that --resolve made
         return _run(args, plant, [*given, *added], held_out)
 

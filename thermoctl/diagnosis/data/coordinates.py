@@ -91,6 +91,7 @@ def quick(n: int) -> int:
     """Return the largest number up to n without a large prime factor, for a fast DCT."""
 
     def without_small_primes(m: int) -> int:
+        """Return the factor of `m` without primes up to 31."""
         for p in (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31):
             while m % p == 0:
                 m //= p

@@ -88,6 +88,7 @@ def noise_of_means(plant: Plant, drives: Sequence[Excitation], block: int) -> tu
     """Return the noise of each output in means of `block` rows: only the white part becomes smaller."""
 
     def mean(n: Noise, stated: object) -> Noise:
+        """Return the noise of a mean of readings: only the white part becomes smaller."""
         white = stated.white if isinstance(stated, SensorNoise) else n.sigma
         return dataclasses.replace(n, sigma=float(np.sqrt(max(n.sigma**2 - white**2 * (1 - 1 / block), 0.0))))
 

@@ -26,7 +26,7 @@ from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, batches, each
 
-SURE = 3  # number of refits
+SURE = 3  # number of refits of a case that tell how far its promises are right
 
 
 @dataclass(frozen=True)

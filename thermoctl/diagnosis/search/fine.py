@@ -16,15 +16,13 @@ from thermoctl.diagnosis.search.gains import Direction, score
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import groups_of
-from thermoctl.plant.simulation.simulate import Excitation
 
-Upper = tuple[
-    Channel, np.ndarray
-]  # a channel of all samples; weights of its rows, 0 where others are screened
+# A channel of all samples, and the weights of its rows: 0 for the rows that the screening has.
+Upper = tuple[Channel, np.ndarray]
 
 
 def above(whole: Coordinates, inverse: Sequence[np.ndarray], screened: Coordinates) -> list[Upper]:
-    """Return the channels whose rows above those of the screening exist. `inverse`: 1 / variance by band."""
+    """Return the channels that have rows above those of the screening. `inverse`: 1 / variance by band."""
     low = {(c.recording, c.output): c.rows for c in screened.channels}
     out = []
     for c, v in zip(whole.channels, inverse, strict=True):
@@ -50,7 +48,7 @@ def fine(
         """Return whitened rows of the output's values (N, ...) by recording."""
         return np.concatenate([(transform(k, e[k.recording]).T * w).T for k, w in own])
 
-    residual = rows([_error(d, run.y, j) for d, run in zip(metric.drives, metric.runs, strict=True)])
+    residual = rows([d.y[:, j] - run.y[:, j] for d, run in zip(metric.drives, metric.runs, strict=True)])
     best: dict[int, Direction] = {}
     for g in groups_of(c, metric):
         if "picked_from" in g.sizes[0][0]:
@@ -61,7 +59,3 @@ def fine(
             d = rows([np.stack(part, axis=1) for part in changed])
             score(columns, d, d.T @ residual, np.linalg.norm(d, axis=0), best)
     return [dataclasses.replace(d, vector=None) for d in best.values() if d.gain > 0]
-
-
-def _error(d: Excitation, y: np.ndarray, j: int) -> np.ndarray:
-    return np.asarray(d.y[:, j] - y[:, j])
