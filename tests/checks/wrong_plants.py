@@ -15,7 +15,6 @@ from tests.checks.rigs import PLANTS, rig
 from tests.checks.test_checks import DAMAGES, WRONG
 from thermoctl.checks import checks
 from thermoctl.diagnosis.diagnose import diagnose
-from thermoctl.diagnosis.evidence.held_out import split
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import relabelled
@@ -98,7 +97,7 @@ def judged(plant: Plant, table: Table, right: set[str]) -> tuple[str, str]:
         return "found", f"{severe[0].kind}: {severe[0].what}"[:90]
     try:
         done = diagnose(plant, [table], catalogue((CATALOGUE,)), limits())
-        if wrong := relabelled(done, split([table], ())[0], limits()):
+        if wrong := relabelled(done, limits()):
             return "found", f"{wrong[0].kind}: {wrong[0].what}"[:90]
         found = contract(done)
     except InputError as e:

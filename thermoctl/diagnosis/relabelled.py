@@ -1,7 +1,8 @@
 """Findings of a diagnosis that wrong columns explain better: swapped columns, and gains that no sensor has.
 
 The checks before a diagnosis find swapped columns where nothing else is missing. Here each pair is swapped
-in the recordings. These hold the same numbers under other names, so that log evidences can be compared:
+in the rows that were diagnosed. These hold the same numbers under other names, so that log evidences can be
+compared:
 
     swapped where  score(best with the pair swapped) - score(best as recorded) > log(RARITY pairs)
               and  misfit(best with the pair swapped) < HALF misfit(best as recorded), if that leaves one
@@ -14,14 +15,13 @@ Only a pair that improves the plant without effects by as much is searched for e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import exp, log
 
 import numpy as np
 
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
-from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.data.case import Budget, Case, with_columns
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
@@ -29,7 +29,6 @@ from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.simulation.simulate import SimulationError
-from thermoctl.recording.table import Table
 
 # Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
 # degC.
@@ -38,28 +37,31 @@ HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all 
 GAIN, SIZE = "sensor_gain", "A"
 
 
-def relabelled(found: Diagnosis, tables: Sequence[Table], limits: Thresholds) -> list[Finding]:
+def relabelled(found: Diagnosis, limits: Thresholds) -> list[Finding]:
     """Return severe findings where a wrong column explains the recordings better than the diagnosis.
 
-    `tables`: the recordings that took part in the choice, as they were given. A diagnosis that goes on from
-    an earlier one is not checked: the earlier recordings are not there."""
+    A diagnosis that goes on from an earlier one is not checked: the earlier recordings are not there."""
     if found.decision.verdict == "consistent" or found.case.memory.recordings:
         return []
-    where = tables[0].path if len(tables) == 1 else f"{tables[0].path} and {len(tables) - 1} more"
-    swapped = _swapped(found, tables, limits, where)
+    first, *more = dict.fromkeys(t.path for t in found.case.tables)
+    where = f"{first} and {len(more)} more" if more else first
+    swapped = _swapped(found, limits, where)
     return [swapped] if swapped else absurd(found, where)
 
 
-def _swapped(found: Diagnosis, tables: Sequence[Table], limits: Thresholds, where: str) -> Finding | None:
+def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None:
+    """Return a finding where the recordings with two columns swapped are far likelier."""
     known, now = found.case, {w.fitted.hypothesis.keys: w.score for w in found.searched.tried}
     inputs = {i.column for i in known.plant.inputs.values()}
-    pairs = [h for h in swaps(known.plant, tables) if len(inputs & {*h.columns}) != 1]
+    pairs = [h for h in swaps(known.plant, known.tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Case] | None = None
     for h in pairs:
         budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
-            again = case(known.plant, [h.change(t) for t in tables], known.catalogue, budget)
+            again = with_columns(known, h.change, budget)
+            if again.null.cost > known.null.cost:
+                continue
             score = fitted(again, again.plant, (), again.null).log_evidence
         except (SimulationError, InputError, np.linalg.LinAlgError):
             continue

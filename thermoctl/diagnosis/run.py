@@ -14,7 +14,6 @@ from typing import Any
 from thermoctl.diagnosis import diagnose as engine
 from thermoctl.diagnosis.data import memory
 from thermoctl.diagnosis.evidence.fit import remembered
-from thermoctl.diagnosis.evidence.held_out import split
 from thermoctl.diagnosis.experiment import file as experiment_file
 from thermoctl.diagnosis.experiment.design import NONE, Ranges
 from thermoctl.diagnosis.experiment.propose import propose
@@ -84,9 +83,7 @@ def diagnose(
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
-    if not (anyway or stopped()) and (
-        wrong := relabelled(diagnosis, split(chosen_on, reserve)[0], numbers())
-    ):
+    if not (anyway or stopped()) and (wrong := relabelled(diagnosis, numbers())):
         raise InputError(f"{wrong[0]} (--anyway diagnoses in spite of it)")
     proposed = None if stopped() else propose(diagnosis, drivable, limits, progress)
     result = contract(diagnosis)
