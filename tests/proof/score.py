@@ -24,6 +24,14 @@ FAILED: Mapping[str, Any] = {"verdict": "failed", "findings": [], "alternatives"
 
 Named = tuple[str, str]  # an effect and its place
 
+# Small misfits of the open world (tests/concealed/open_world.py) that are entries of the catalogue, too
+MISFITS = {
+    "slow reference": "sensor_lag",
+    "stem": "sensor_gain",
+    "contacts": "temperature_dependent_conductance",
+    "finite bodies": "hidden_thermal_mass",
+}
+
 
 @dataclass
 class Row:
@@ -57,7 +65,8 @@ class Row:
     cpu_s: float | None
     error: str | None
     world: str = "closed"  # open: with small misfits of no known name
-    strays: int = 0  # findings that are neither a true effect nor an equivalent one
+    strays: int = 0  # findings that are not there, and not equivalent to what is there
+    of_misfits: int = 0  # findings that are a small misfit of the open world itself
     calibration: list[tuple[float, bool]] = field(default_factory=list)
     parameters: list[dict[str, Any]] = field(default_factory=list)
 
@@ -78,6 +87,7 @@ class Truth:
     equivalent_names: frozenset[str]
     equivalent_places: list[Named]
     also_right: list[Named]
+    misfits: list[Named]  # names of the small misfits that the catalogue has; place "all": anywhere
 
     @classmethod
     def of(cls, case: str, answer: Mapping[str, Any]) -> Truth:
@@ -94,6 +104,7 @@ class Truth:
             frozenset(answer["nearly_the_same"]),
             [(e, w) for e, w in answer.get("nearly_the_same_places", [])],
             [(e, w) for e, w in answer.get("also_right", [])],
+            [(MISFITS[m], w) for m, w in answer.get("misfits", []) if m in MISFITS],
         )
 
     def names(self, found: Named, true: Named) -> bool:
@@ -103,6 +114,10 @@ class Truth:
     def named_by(self, found: Named) -> bool:
         """Check whether a finding names any true effect."""
         return any(self.names(found, t) for t in self.effects)
+
+    def of_misfit(self, found: Named) -> bool:
+        """Check whether a finding is a small misfit of the open world, which is there, too."""
+        return any(found[0] == e and w in (found[1], "all") for e, w in self.misfits)
 
     def at(self, found: Named) -> bool:
         """Check whether a finding is at the place of a true effect, or at one equivalent to it."""
@@ -118,7 +133,7 @@ class Truth:
         """Check whether effect and place are exactly true; equivalents do not count."""
         effect, place = found
         right = any(effect == e and same_place(e, place, w) for e, w in self.effects)
-        return right or found in self.also_right
+        return right or found in self.also_right or self.of_misfit(found)
 
 
 def _kind(effects: Sequence[Named]) -> str:
@@ -144,6 +159,8 @@ def score(
     findings = [(f["effect"], f["where"]) for f in result["findings"]]
     everything = findings + [(f["effect"], f["where"]) for f in result["alternatives"]]
     right_by_name = [f for f in findings if truth.named_by(f)]
+    of_misfits = [f for f in findings if f not in right_by_name and truth.of_misfit(f)]
+    others = [f for f in findings if f not in of_misfits]
     names = {e for e, _ in everything}
     known = bool(truth.effects) and truth.kind != "unknown"
     return Row(
@@ -160,10 +177,10 @@ def score(
         findings=findings,
         detected=verdict not in ("consistent", "failed"),
         named=verdict in NAMING and bool(findings),
-        exact=bool(truth.effects) and Counter(e for e, _ in findings) == Counter(e for e, _ in truth.effects),
+        exact=bool(truth.effects) and Counter(e for e, _ in others) == Counter(e for e, _ in truth.effects),
         alike=bool(truth.effects)
-        and len(findings) == len(truth.effects)
-        and _matched(findings, truth.effects, truth.names),
+        and len(others) == len(truth.effects)
+        and _matched(others, truth.effects, truth.names),
         placed=all(map(truth.at, right_by_name)) if right_by_name else None,
         inside=all(any(truth.names(f, t) for f in everything) for t in truth.effects) if known else None,
         inside_exact=all(t[0] in names for t in truth.effects) if known else None,
@@ -174,7 +191,8 @@ def score(
         cpu_s=cpu_s,
         error=error,
         world=str(answer.get("world", "closed")),
-        strays=len(findings) - len(right_by_name),
+        strays=len(others) - len(right_by_name),
+        of_misfits=len(of_misfits),
         calibration=[
             (float(f["probability"]), truth.holds((f["effect"], f["where"])))
             for f in [*result["findings"], *result["alternatives"]]

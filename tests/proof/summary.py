@@ -170,11 +170,12 @@ def open_world(rows: Sequence[Row]) -> dict[str, Any]:
         "named_and_placed": share(r.alike and bool(r.placed) for r in visible),
         "truth_among_findings": share(bool(r.named and r.inside) for r in visible),
         "without_strays": share(r.strays == 0 for r in rows),
-        "nothing_named_where_nothing_is": share(not r.findings for r in null),
+        "nothing_named_where_nothing_is": share(len(r.findings) == r.of_misfits for r in null),
         "unknown_not_named": share(not r.named for r in rows if r.kind == "unknown"),
     }
     figures = {
         "strays_per_diagnosis": sum(r.strays for r in rows) / len(rows),
+        "names_of_misfits": sum(r.of_misfits for r in rows),
         "calibration_error": reliability(given)[1],
         "calibration_error_by_chance": by_chance(given),
         "gain_median": quantile((r.gain for r in visible if r.findings), 0.5),

@@ -117,6 +117,18 @@ def test_pairs_need_both():
     assert both.kind == "pair"
 
 
+def test_a_small_misfit_of_the_open_world_that_the_catalogue_has_is_no_stray():
+    told = answer(("radiation", "a")) | {"world": "open", "misfits": [["slow reference", "y"], ["bend", "z"]]}
+    found = [finding(*n, 0.95) for n in (("radiation", "a"), ("sensor_lag", "y"), ("sensor_lag", "z"))]
+    both, wrong = (score.score("1", told, result("partly_explained", found[:n])) for n in (2, 3))
+    assert (both.strays, both.of_misfits, both.alike) == (0, 1, True)
+    assert (wrong.strays, wrong.of_misfits, wrong.alike) == (1, 1, False)
+    none = score.score("2", told | {"effects": []}, result("explained", found[1:2]))
+    content = summary.summary([both, wrong, none])["open_world"]
+    assert content["shares"]["nothing_named_where_nothing_is"]["share"] == 1.0
+    assert content["figures"]["names_of_misfits"] == 3
+
+
 def test_in_the_open_world_strays_count_and_a_partly_explained_name_is_a_name():
     told = answer(("radiation", "a"), band="large") | {"world": "open"}
     found = [finding("radiation", "a", 0.97), finding("sensor_drift", "y", 0.7)]

@@ -103,7 +103,7 @@ def _generated(world: str, name: str, folder: Path) -> Case:
         """Return the test of a name for being this true effect, or one that the data cannot tell from it, at its place."""
         return lambda name: truth.names(name, true) and truth.at(name)
 
-    return Case(world, _job(name, folder), answer, tuple(map(is_it, known)))
+    return Case(world, _job(name, folder), answer, tuple(map(is_it, known)), truth.of_misfit)
 
 
 def _job(name: str, folder: Path, held_out: tuple[str, ...] = ()) -> Job:
