@@ -83,9 +83,11 @@ def sampled(case: Path) -> dict[str, object]:
 
     plant = load(case / "plant.yaml")
     tables = read_recordings(plant, sorted(map(str, case.glob("run_*.csv"))))
-    with tempfile.TemporaryDirectory() as folder:
-        result = diagnose(plant, tables, Path(folder) / "out")
-    signal.setitimer(signal.ITIMER_PROF, 0)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            result = diagnose(plant, tables, Path(folder) / "out")
+    finally:  # at the end of the process its signal would kill it, and hide the error
+        signal.setitimer(signal.ITIMER_PROF, 0)
     own, children = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     scale = (own.ru_utime + own.ru_stime) / max(sum(found.values()), 1)  # a call into C takes several ticks
     seconds = {k: n * scale for k, n in found.items()}
@@ -112,7 +114,7 @@ def measured(case: Path, checkout: Path, bytecode: str) -> dict[str, object]:
             "PYTHONDONTWRITEBYTECODE": "",
             "PYTHONPYCACHEPREFIX": bytecode,
         }
-        out = subprocess.run(call, capture_output=True, text=True, check=True, env=own, cwd=cache).stdout
+        out = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True, env=own, cwd=cache).stdout
     return dict(json.loads(out.splitlines()[-1]))
 
 
