@@ -60,7 +60,7 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
         budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
             again = with_columns(known, h.change, budget)
-            if again.null.cost > known.null.cost:
+            if again is None:
                 continue
             score = fitted(again, again.plant, (), again.null).log_evidence
         except (SimulationError, InputError, np.linalg.LinAlgError):

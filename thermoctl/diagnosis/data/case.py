@@ -23,6 +23,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back
 from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
@@ -33,6 +34,9 @@ LEAST = 40  # least number of measured values of at least one output
 STATED = 12  # least number if the plant file states the output's noise, so that it is not estimated
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
+# Predicted cost with other columns, over that as recorded: 0.00 to 0.93 where 16 pairs of columns of six
+# concealed cases were swapped, 14 and more where they were not.
+FAR_WORSE = 5.0
 FAST = 0.01  # share of an output's changes that may be jumps
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
@@ -220,16 +224,22 @@ def case(
     )
 
 
-def with_columns(known: Case, change: Callable[[Table], Table], budget: Budget) -> Case:
+def with_columns(known: Case, change: Callable[[Table], Table], budget: Budget) -> Case | None:
     """Return the case with changed columns in the same rows, so that log evidences can be compared.
 
-    Nothing is averaged or left out again. The refit ends early if it stays worse than that of `known`.
-    Raises SimulationError."""
+    Nothing is averaged or left out again. None if the refit stays worse than that of `known`, or if a linear
+    step from there predicts that it will stay far worse. Raises SimulationError."""
     tables, model = tuple(change(t) for t in known.tables), known.null.model
     drives = [dataclasses.replace(model.excitation(t), rtol=known.rtol) for t in tables]
+    first = Problem(model, drives, known.noise).evaluate(known.null.z, True)
+    step = np.linalg.lstsq(first.matrix, first.gradient, rcond=None)[0]
+    if first.cost - first.gradient @ step > FAR_WORSE * known.null.cost:
+        return None
     null = fit(
         model, drives, known.noise, iterations=40, tolerance=ROUGH, seconds=np.inf, goal=known.null.cost
     )
+    if null.cost > known.null.cost:
+        return None
     coordinates = Coordinates(drives)
     grids = _grids(coordinates, drives, null, known.block)
     return dataclasses.replace(
