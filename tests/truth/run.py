@@ -1,4 +1,4 @@
-"""Diagnose one case without report, experiment and test for swapped columns; keep result and search."""
+"""Diagnose one case without report and experiment; keep result and search."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from thermoctl.diagnosis import diagnose as engine
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import Thresholds, limits
+from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.files.yamlfile import InputError
@@ -55,9 +56,11 @@ def diagnose(job: Job, out: str) -> Run:
 
 def _result(job: Job, path: Path) -> dict[str, Any]:
     found = sought(job, limits())
-    result = contract(engine.decided(found))
     _keep(found, path)
-    return result
+    diagnosis = engine.decided(found)
+    if wrong := relabelled(diagnosis, limits()):
+        raise InputError(str(wrong[0]))
+    return contract(diagnosis)
 
 
 def sought(job: Job, numbers: Thresholds) -> engine.Sought:
