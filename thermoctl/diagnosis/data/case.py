@@ -227,8 +227,8 @@ def case(
 def with_columns(known: Case, change: Callable[[Table], Table], budget: Budget) -> Case | None:
     """Return the case with changed columns in the same rows, so that log evidences can be compared.
 
-    Nothing is averaged or left out again. None if the refit stays worse than that of `known`, or if a linear
-    step from there predicts that it will stay far worse. Raises SimulationError."""
+    Nothing is averaged or left out again. None if the refit stays worse than that of `known`. A linear step
+    from there predicts most such refits, which are not made. Raises SimulationError."""
     tables, model = tuple(change(t) for t in known.tables), known.null.model
     drives = [dataclasses.replace(model.excitation(t), rtol=known.rtol) for t in tables]
     first = Problem(model, drives, known.noise).evaluate(known.null.z, True)
