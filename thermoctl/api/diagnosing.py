@@ -15,7 +15,6 @@ from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.plots import over_time
 from thermoctl.checks import checks
 from thermoctl.diagnosis.diagnose import diagnose as _diagnose
-from thermoctl.diagnosis.evidence.held_out import split
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import relabelled
@@ -134,6 +133,6 @@ def diagnose(
     entries = catalogue((CATALOGUE, *map(Path, effects)))
     reserve = tables_of(own.description, held_out)
     outcome = _diagnose(own.description, tables, entries, limits(), reserve)
-    if not anyway and (wrong := relabelled(outcome, split(tables, reserve)[0], limits())):
+    if not anyway and (wrong := relabelled(outcome, limits())):
         raise InputError(f"{wrong[0]} (anyway=True diagnoses in spite of it)")
     return Diagnosis(own, outcome)

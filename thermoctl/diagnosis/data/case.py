@@ -34,8 +34,8 @@ LEAST = 40  # least number of measured values of at least one output
 STATED = 12  # least number if the plant file states the output's noise, so that it is not estimated
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
-# Predicted cost with other columns, over that as recorded: 0.00 to 0.93 where 16 pairs of columns of six
-# concealed cases were swapped, 14 and more where they were not.
+# Predicted cost with other columns, over that as recorded. In six concealed cases it was 0.00 to 0.93 for 16
+# pairs of columns that were swapped. For those that were not it was 14 and more.
 FAR_WORSE = 5.0
 FAST = 0.01  # share of an output's changes that may be jumps
 TOLD = 6  # largest number of outliers' times that a note lists for a column
