@@ -51,12 +51,14 @@ class Tracked:
     - `metric`: whitened rows at the trajectory, and the projection
     - `target` (rows,): the misfit that a law has to explain
     - `free`: by node, the responses (rows, k) to a free flow in time into it, each knot's of typical size
-    - `beyond`: directions that a free flow into another node absorbs, or None"""
+    - `beyond`: directions that a free flow into another node absorbs, or None
+    - `resolved`: number of hat functions of a flow"""
 
     metric: Rows
     target: np.ndarray
     free: dict[str, np.ndarray]
     beyond: Absorbed | None = None
+    resolved: int = RESOLVED
     _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @property
@@ -77,7 +79,7 @@ class Tracked:
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return the whitened, projected responses (rows, k) to flows (N, k), by recording, at a place.
 
-        They are sums of the responses to RESOLVED hat functions. A storage that is larger by q acts like the
+        They are sums of the responses to hat functions. A storage that is larger by q acts like the
         flow -q dx/dt into the node. A flow that the plant's own parameters absorb gives zeros."""
         if place.part == "storage":
             flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
@@ -108,7 +110,7 @@ class Tracked:
 
     @cached_property
     def _hats(self) -> list[csr_matrix]:
-        return [hat_functions(d.t, min(RESOLVED, len(d.t))) for d in self.metric.drives]
+        return [hat_functions(d.t, min(self.resolved, len(d.t))) for d in self.metric.drives]
 
     def _slopes(self, node: str) -> list[np.ndarray]:
         """Return the slope dx/dt of a node (N,) by recording, without the part of the unknown flow.
