@@ -14,9 +14,9 @@ from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search import again
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import directions, groups_of, screen
-from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 from thermoctl.diagnosis.search.sketch import SKETCHES, likeliest, products
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
@@ -30,7 +30,7 @@ def chain(tmp_path_factory):
     plant = load(folder / "plant.yaml")
     known = case(plant, read_recordings(plant, [folder / "run_1.csv"]), catalogue(), Budget(80))
     first = fitted(known, known.plant, (), known.null)
-    metric = Rows(Plain(known, first, ROWS), first.average, False)
+    metric = Metric(Plain(known, first, ROWS), first.average, False)
     rig = Rig(first.rough_plant, metric.drives, [t.columns for t in known.tables])
     found = candidates(rig, known.catalogue)
     return metric, rig, found, [Trajectory(metric, rig, 0)]

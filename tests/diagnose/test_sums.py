@@ -12,9 +12,8 @@ from thermoctl.diagnosis.evidence.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.law.smooth import _smoothed
 from thermoctl.diagnosis.run import diagnose
-from thermoctl.diagnosis.search.metric import Absorbed
+from thermoctl.diagnosis.search.metric import FREE, ROWS, Absorbed, Metric, Plain
 from thermoctl.diagnosis.search.overlay import _filtered
-from thermoctl.diagnosis.search.screening import FREE, ROWS, Plain, Rows
 from thermoctl.plant.fitting import residuals
 
 
@@ -28,7 +27,7 @@ def test_the_metric_is_that_of_noise_free_parameters_and_starts_within_their_pri
     """Against the covariance of all rows: the noise's and the one that all unknowns add, side by side."""
     null = fitted(known, known.plant, (), known.null)
     plain = Plain(known, null, ROWS)
-    metric = Rows(plain, as_refitted(known, null).average, True)
+    metric = Metric(plain, as_refitted(known, null).average, True)
     whole, at = np.zeros((len(metric.weight), len(plain.problem.unknowns))), 0
     for r, rows in enumerate(plain.sensitivities):
         whole[at : at + len(rows), plain.unknowns(r)] = rows

@@ -23,7 +23,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import SPREAD
-from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -136,7 +136,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
     off the gain. Raises SimulationError."""
     refitted = as_refitted(case, f)
-    metric = Rows(Plain(case, f, ROWS), refitted.average, True)
+    metric = Metric(Plain(case, f, ROWS), refitted.average, True)
     linear = Tracked(metric, metric.residual, {}, resolved=SKETCHED)
     rig = Rig(f.rough_plant, metric.drives, [t.columns for t in case.tables])
     where = places(rig)

@@ -26,8 +26,7 @@ from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnosis.law.signals import Place, Values
-from thermoctl.diagnosis.search.metric import Absorbed
-from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.diagnosis.search.metric import ROWS, Absorbed, Metric, Plain
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.fitting.residuals import Problem
@@ -54,7 +53,7 @@ class Tracked:
     - `beyond`: directions that a free flow into another node absorbs, or None
     - `resolved`: number of hat functions of a flow"""
 
-    metric: Rows
+    metric: Metric
     target: np.ndarray
     free: dict[str, np.ndarray]
     beyond: Absorbed | None = None
@@ -140,7 +139,7 @@ def _gain(share: float, square: np.ndarray, force: np.ndarray) -> float:
     return 0.5 * float(np.sum(force * share**2 / more - np.log(more)))
 
 
-def flow_rows(metric: Rows, node: str, hats: Sequence[csr_matrix], size: float = 1.0) -> list[np.ndarray]:
+def flow_rows(metric: Metric, node: str, hats: Sequence[csr_matrix], size: float = 1.0) -> list[np.ndarray]:
     """Return, by recording, the rows of the responses to flows into a node: hat functions times `size`.
 
     To save memory, TOGETHER responses are simulated at a time."""
@@ -183,7 +182,7 @@ class _Followed:
     - `misfit`: by recording, whitened rows of y - y(u^) + D u^
     - `wide`: by recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
 
-    metric: Rows
+    metric: Metric
     misfit: list[np.ndarray]
     wide: list[np.ndarray]
 
@@ -215,7 +214,7 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
         )
         try:
             plain = _at(dataclasses.replace(case, tables=tables), f, plant, model, z)
-            metric = Rows(plain, average, False)
+            metric = Metric(plain, average, False)
         except SimulationError:
             break
         sizes = sizes or [typical_flow(plant, n, metric.signals) or 1.0 for n in nodes]
@@ -249,7 +248,7 @@ def _at(case: Case, f: Fitted, plant: Plant, model: Model, z: np.ndarray) -> Pla
     return Plain(case, dataclasses.replace(f, rough=rough, rough_plant=plant), ROWS)
 
 
-def _started(plain: Plain, metric: Rows, left: Sequence[np.ndarray]) -> np.ndarray:
+def _started(plain: Plain, metric: Metric, left: Sequence[np.ndarray]) -> np.ndarray:
     """Return the unknowns after a step of the initial states to errors (rows,) that flows leave."""
     z, first = metric.fit.z.copy(), plain.problem.n_parameters
     edges = np.cumsum([len(e) for e in left])[:-1]

@@ -23,9 +23,9 @@ from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Norms, directions, groups_of
-from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
 
 SEEN = 5.0  # an effect shows if its size is this many standard errors
 ABSORBED = 1e-4  # an effect is imitated if the projection leaves less than this share of its direction's norm
@@ -83,7 +83,7 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     """Return the smallest visible size of every effect at every place, by effect and place.
 
     `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
-    metric = Rows(Plain(case, null, ROWS), average, True)
+    metric = Metric(Plain(case, null, ROWS), average, True)
     rig = Rig(null.rough_plant, metric.drives, [t.columns for t in case.tables])
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
@@ -125,7 +125,7 @@ def _times(column: Column, left: float) -> float:
 
 
 def _norms(
-    metric: Rows, trajectories: Sequence[Trajectory], columns: Iterable[Column]
+    metric: Metric, trajectories: Sequence[Trajectory], columns: Iterable[Column]
 ) -> Iterator[tuple[Norms, Rms]]:
     readings = np.concatenate([d.y for d in metric.drives])
     names = metric.model.outputs
@@ -143,7 +143,7 @@ def _norms(
             yield Norms(column, float(whole), float(size)), rms
 
 
-def _energies(metric: Rows, plain: np.ndarray) -> dict[int, np.ndarray]:
+def _energies(metric: Metric, plain: np.ndarray) -> dict[int, np.ndarray]:
     """Return the sum of squares (k,) of rows (rows, k), not whitened, by output."""
     energies: dict[int, np.ndarray] = {}
     begin = 0

@@ -28,7 +28,7 @@ from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.evidence.where import typical_flow, typical_rate
 from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.screening import ROWS, Plain, Rows
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -84,7 +84,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
 
     Raises SimulationError."""
     f = as_weighed(f)
-    metric = Rows(Plain(case, f, ROWS), f.average, True)
+    metric = Metric(Plain(case, f, ROWS), f.average, True)
     knots = int(np.clip(TOGETHER // len(metric.runs), FEWEST, KNOTS))
     hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
     coarse = {name for name, is_coarse in zip(case.measured, rounded(case), strict=True) if is_coarse}
@@ -119,7 +119,7 @@ def _ways(
                 yield f.name, responses[f.target] - responses[f.source], size
 
 
-def evidence(metric: Rows, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
+def evidence(metric: Metric, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method, and w.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
