@@ -11,7 +11,7 @@ from scipy.stats import multivariate_t, norm
 
 from tests.plants import HEATER
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.evidence.fit import Placed, Posterior, evidence_at, fitted, log_density
+from thermoctl.diagnosis.evidence.fit import Placed, Posterior, fitted, log_density
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
@@ -100,7 +100,13 @@ def test_laplace_agrees_with_importance_sampling(name):
     z = draw.rvs(300).reshape(300, -1)
     low, high = posterior.bounds
     inside = np.all((z >= low) & (z <= high), axis=1)
-    weight = [evidence_at(posterior, q, found) - draw.logpdf(q) for q in z[inside]]
+
+    def evidence(q):
+        """Return log p(D | z) + log p(z) at z = q."""
+        likelihood = posterior.likelihood(posterior.rows(posterior.errors(q)))[0].log_likelihood
+        return likelihood + log_density(posterior, q, found.sd)
+
+    weight = [evidence(q) - draw.logpdf(q) for q in z[inside]]
     sampled = float(logsumexp(weight) - np.log(len(z)))
     # an unknown ambient has a valley, conductance times distance from the air, that is no Gaussian: 2 nats too much
     within = 2.5 if name == "unknown input" else 1.0

@@ -94,7 +94,7 @@ def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
     own = tmp_path / "own"
     assert main(["effects", "save", str(tmp_path), "peltier", "--effects", str(own)]) == 0
     assert yaml.safe_load((own / "peltier.yaml").read_text())["effect"] == "peltier"
-    rig = Rig(made.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = known.rig(made.plant, known.drives(known.null.model))
     entries = catalogue([own])
     assert [c.key for c in candidates(rig, entries)] == [("peltier", "broth")]
     save(made.plant, tmp_path / "plant.yaml")
@@ -107,7 +107,7 @@ def test_a_law_keeps_its_prior_odds_beside_effects(found):
     """It had the odds of an entry of the catalogue there, so that any effect beside a law gained some ten nats."""
     _, d, law = found
     known, leader = d.case, d.searched.tried[0]
-    rig = Rig(known.plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = known.rig(known.plant, known.drives(known.null.model))
     other = Placed(candidates(rig, catalogue())[0], {})
     places = {other.key[0]: {other.key[1]}}
     alone, beside = (odds((*effects, other), places, limits()) for effects in ((), (law.placed,)))
@@ -154,7 +154,7 @@ def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
     known = d.case
     broth = made.plant.nodes["broth"]
     plant = replace(made.plant, nodes={**made.plant.nodes, "shell": replace(broth, name="shell")})
-    rig = Rig(plant, known.drives(known.null.model), [t.columns for t in known.tables])
+    rig = known.rig(plant, known.drives(known.null.model))
     c = law_candidate(rig, replace(law.proposal, place=Place("shell", None, part)))
     assert c.place.nodes == {"target": "shell"} and "shell" not in known.plant.nodes
 

@@ -133,6 +133,10 @@ class Case:
             return self._excitations(model)
         return [dataclasses.replace(d, x0=_start(d, null.states, model)) for d in self._read]
 
+    def rig(self, plant: Plant, drives: Sequence[Excitation]) -> Rig:
+        """Return the parts and signals of a plant, with these recordings."""
+        return Rig(plant, drives, [t.columns for t in self.tables])
+
     @cached_property
     def _read(self) -> list[Excitation]:
         return self._excitations(self.null.model)

@@ -429,15 +429,6 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
     return out - periods * float(np.log(PERIODS))
 
 
-def evidence_at(posterior: Posterior, z: np.ndarray, hypothesis: Fitted) -> float:
-    """Return log p(D | z) + log p(z), the integrand of `log_evidence`.
-
-    The standard deviations of the effects' sizes are those of `hypothesis`."""
-    return posterior.likelihood(posterior.rows(posterior.errors(z)))[0].log_likelihood + log_density(
-        posterior, z, hypothesis.sd
-    )
-
-
 def _size(p: EffectParameter, value: float, sd: float) -> float:
     """Return the log prior density of an effect's size: log-uniform over DECADES decades or its bounds.
 

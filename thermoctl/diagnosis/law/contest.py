@@ -18,7 +18,8 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.propose import Proposal, pays, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.free import pays
+from thermoctl.diagnosis.law.propose import Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (

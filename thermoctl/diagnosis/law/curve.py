@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoctl.diagnosis.law.propose import PIECES, Proposal, pieces
+from thermoctl.diagnosis.law.free import PIECES, pieces
+from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.signals import Signal
 from thermoctl.diagnosis.law.smooth import Tracked
 from thermoctl.plant import expression as ex

@@ -19,23 +19,26 @@ from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.unknown import located, reached
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
+from thermoctl.diagnosis.law.free import (
+    NODES,
+    choices,
+    cost_of,
+    energy,
+    log_number,
+    predicted,
+    ranked,
+    unlikely,
+)
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import SPREAD
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
-PIECES = 8  # number of knots of a free function of a signal
 # Largest number of nodes with an unknown flow, those that explain the residual best: 24 knots each.
 TRACKED = 20
-# Number of hat functions of a flow in `pays`. It changed the answer in two of 40 cases, both near the limit.
-SKETCHED = 200
-NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
 SECOND = 10  # number of signals of a place that may be the second one of a form
-RANKED, COMBINATIONS = 40, 12  # (place, signal) pairs whose free function is scored; whose forms are tried
-SEEN = 1e-6  # least singular value over the largest one; smaller ones are rounding errors
+COMBINATIONS = 12  # number of ranked (place, signal) pairs whose forms are tried
 POOL = 60  # number of terms from which sums of terms are built
 PAIRED = 600  # number of terms that are tried two at a time
 PAIRS, LIKELY = 24, 50_000  # number of pairs that are kept; number of best pairs among which they are sought
@@ -70,7 +73,7 @@ class Proposal:
         second signal adds one more choice. A flow that a difference or a velocity drives usually reverses
         with it: other terms have the prior `rare`."""
         chosen = self.look * sum(max(len(t.signals), 1) for t in self.terms)
-        chosen += len(self.terms) * _unlikely(self.limits)
+        chosen += len(self.terms) * unlikely(self.limits)
         return chosen + float(np.log(2)) * self.shapes + sum(self._form_cost(t) for t in self.terms)
 
     def _form_cost(self, t: Term) -> float:
@@ -96,11 +99,6 @@ class Proposal:
         return self.promise - self.cost
 
 
-def _unlikely(limits: Thresholds) -> float:
-    """Return minus the log of the prior odds of one term."""
-    return -float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """A term at a place: its gain in energy, and its responses (rows, sizes)."""
@@ -119,50 +117,14 @@ class Found:
 def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposal]:
     """Return the most promising laws, best first. Raises SimulationError."""
     rig, where, linear = linearised(case, parent)
-    combos = _combos(rig, where, linear.likely[:NODES], linear)
-    pool = _terms(linear, _ranked(linear, combos), COMBINATIONS)
-    base = _look(combos), limits
+    combos = choices(rig, where, linear.likely[:NODES], linear)
+    pool = _terms(linear, ranked(linear, combos), COMBINATIONS)
+    base = log_number(combos), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
         out += _sums(linear, place, [f for f in pool if f.place == place], base)
     out.sort(key=lambda p: -p.score)
     return _mixed(out)
-
-
-def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
-    """Return whether a law may be worth its odds beside a hypothesis that leaves only noise.
-
-    Where a law fits much better than the hypothesis, a free function of a signal gains something there. At a
-    velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
-    off the gain. Raises SimulationError."""
-    refitted = as_refitted(case, f)
-    metric = Metric(Plain(case, f, ROWS), refitted.average, True)
-    linear = Tracked(metric, metric.residual, {}, resolved=SKETCHED)
-    rig = Rig(f.rough_plant, metric.drives, [t.columns for t in case.tables])
-    where = places(rig)
-    nodes = [p.target for p in where if p == Place(p.target)]
-    if len(nodes) > NODES:
-        nodes = located(case, refitted, reached(case))[:NODES]
-    combos = _combos(rig, where, nodes, linear)
-    moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
-    both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
-    products = [(p, _along_both(linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
-    look, off = _look(combos), _cost_of(linear, PIECES) - _cost_of(linear, 2)
-    gains = [gain + off for gain, *_ in _ranked(linear, combos)[:1]]
-    gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
-    return SPREAD * max(gains, default=-np.inf) > look + _unlikely(limits)
-
-
-def _combos(
-    rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
-) -> list[tuple[Place, Signal]]:
-    """Return the places at some nodes, each with every signal that a law there may depend on."""
-    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.metric.signals)]
-
-
-def _look(combos: Sequence[tuple[Place, Signal]]) -> float:
-    """Return the log of the number of places, signals and forms that a term is chosen from."""
-    return float(np.log(max(len(combos), 1)) + np.log(len(library())))
 
 
 def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
@@ -191,16 +153,16 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     combos = [
         (p, s) for n in best if (p := Place(n)) in where for s in signals(rig, p, linear.metric.signals)
     ]
-    base = _look(combos), limits
+    base = log_number(combos), limits
     each = []
     for n, other in (best, best[::-1]):
         beside = linear.beside(other, couples[best][1])
-        free = _ranked(beside, [c for c in combos if c[0] == Place(n)])
+        free = ranked(beside, [c for c in combos if c[0] == Place(n)])
         each.append([f for f in _varied(_terms(beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH])
     out = []
     for a, b in itertools.product(*each):
         x = [linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)]
-        promise, c = _promise(linear, np.concatenate(x, axis=1))
+        promise, c = predicted(linear, np.concatenate(x, axis=1))
         laws = (
             Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
         )
@@ -213,76 +175,12 @@ def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
 
     Raises SimulationError."""
     drives = case.drives(parent.rough.model)
-    rig = Rig(parent.rough_plant, drives, [t.columns for t in case.tables])
+    rig = case.rig(parent.rough_plant, drives)
     where = places(rig)
     nodes = [p.target for p in where if p == Place(p.target)]
     if len(nodes) > TRACKED:
         nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
     return rig, where, tracked(case, parent, nodes)
-
-
-def _ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
-    """Return the predicted gain of a free function of a signal at each place, the best first."""
-    gains = _gains(linear, [(p, _free(linear, s)) for p, s in combos])
-    return [(gain, *combos[k]) for gain, k in gains]
-
-
-def _gains(
-    linear: Tracked, functions: Sequence[tuple[Place, Sequence[np.ndarray]]]
-) -> list[tuple[float, int]]:
-    """Return the predicted gain of each free function at its place, and its position, the best first.
-
-    Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
-    functions with the largest gain in energy, and only these are returned."""
-    scored = []
-    for k, (place, flows) in enumerate(functions):
-        x = linear.columns(place, flows)
-        scored.append((_energy(x, linear.target), k, x))
-    scored.sort(key=lambda f: -f[0])
-    out = [(_promise(linear, x)[0] - _cost_of(linear, x.shape[1]), k) for _, k, x in scored[:RANKED]]
-    return sorted(out, key=lambda f: -f[0])
-
-
-def _free(linear: Tracked, s: Signal) -> list[np.ndarray]:
-    """Return the columns (N, knots) of a free function of a signal by recording."""
-    values = linear.along(s.along)
-    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
-    return [pieces(v, knots) for v in values]
-
-
-def _along_both(linear: Tracked, s: Signal, w: Signal) -> list[np.ndarray]:
-    """Return the columns of a free function of a signal times another one: its size, if the first drives."""
-    factors = linear.along(w.along)
-    return [
-        x * (np.abs(f) if s.drives else f)[:, None] for x, f in zip(_free(linear, s), factors, strict=True)
-    ]
-
-
-def _cost_of(linear: Tracked, parameters: int) -> float:
-    """Return the nats that parameters cost: half the log of the number of rows each."""
-    return 0.5 * parameters * float(np.log(len(linear.target)))
-
-
-def _energy(x: np.ndarray, target: np.ndarray) -> float:
-    """Return the part of |target|^2 that columns x explain."""
-    scale = np.linalg.norm(x, axis=0)
-    u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
-
-
-def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Return hat functions of a signal between knots (N, knots): the columns of a free function."""
-    if len(knots) < 2:
-        return np.ones((len(v), 1))
-    return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
-
-
-def _promise(linear: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes."""
-    scale = np.linalg.norm(x, axis=0)
-    scale[scale == 0] = 1.0
-    c = np.linalg.lstsq(x / scale, linear.target, rcond=1e-8)[0] / scale
-    return linear.above(linear.target - x @ c), c
 
 
 def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
@@ -320,7 +218,7 @@ def _best(linear: Tracked, place: Place, f: Family, x: np.ndarray, still: np.nda
         gain = (linear.target @ x) ** 2 / square
         nearly_constant = np.abs(still[:, 0] @ x) > ALIKE * np.sqrt(square) * np.linalg.norm(still)
     if n > 1:
-        gain = np.repeat([_energy(own, linear.target) for own in np.split(x, f.count, axis=1)], n)
+        gain = np.repeat([energy(own, linear.target) for own in np.split(x, f.count, axis=1)], n)
     usable = (np.abs(x).max(axis=0) < HUGE) & (square > 0) & ((n > 1) | ~nearly_constant)
     gain = np.where(usable, gain, -1.0)[::n]
     order = [k for k in np.argsort(-gain, kind="stable")[:KEPT] if gain[k] >= 0]
@@ -357,9 +255,9 @@ def _varied(pool: Sequence[Found]) -> list[Found]:
 def _proposal(
     linear: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, Thresholds]
 ) -> Proposal:
-    promise, c = _promise(linear, x)
+    promise, c = predicted(linear, x)
     p = Proposal(place, law, tuple(map(float, c)), promise, *base)
-    return dataclasses.replace(p, promise=promise - _cost_of(linear, len(c) + p.shapes))
+    return dataclasses.replace(p, promise=promise - cost_of(linear, len(c) + p.shapes))
 
 
 def _sums(

@@ -55,7 +55,7 @@ def refitted_law(
     that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
     for q in (p, *more):
-        rig = Rig(plant, case.drives(parent.rough.model), [t.columns for t in case.tables])
+        rig = case.rig(plant, case.drives(parent.rough.model))
         c = law_candidate(rig, q)
         values, ranges = _start(q)
         plant = c.extend(values, ranges)

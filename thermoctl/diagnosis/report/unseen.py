@@ -20,7 +20,6 @@ from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.noise import Averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values
 from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
@@ -84,7 +83,7 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
 
     `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
     metric = Metric(Plain(case, null, ROWS), average, True)
-    rig = Rig(null.rough_plant, metric.drives, [t.columns for t in case.tables])
+    rig = case.rig(null.rough_plant, metric.drives)
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
     columns = (column for c in placed for g in groups_of(c, metric) for column in g.columns())

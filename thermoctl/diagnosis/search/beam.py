@@ -15,7 +15,6 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.extend import extend, sticking, weaker
@@ -235,10 +234,10 @@ def remade(
 
     Each place is looked up again: its expressions may have held an effect that is not there now."""
     case, placed = s.case, tuple[Placed, ...]()
-    drives, columns = case.drives(case.null.model), [t.columns for t in case.tables]
+    drives = case.drives(case.null.model)
     try:
         for e in effects:
-            found = candidates(Rig(plant, drives, columns), entries)
+            found = candidates(case.rig(plant, drives), entries)
             c = next(c for c in found if (c.key, c.label) == (e.key, e.label))
             inputs = plant.inputs.keys()
             plant = c.extend(e.values, e.ranges)
@@ -422,7 +421,7 @@ def _refitted(
     drives = looked.metric.drives
     try:
         for d in added:
-            rig = Rig(plant, drives, [t.columns for t in case.tables])
+            rig = case.rig(plant, drives)
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
             inputs = plant.inputs.keys()
             plant, own = extend(plant, d, drives)

@@ -17,7 +17,6 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.shipped import shipped
 from thermoctl.plant.fitting.cores import LEAST, each
 from thermoctl.plant.fitting.residuals import Problem
@@ -38,7 +37,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
     starts: dict[Key, list[tuple[float, Plant, Placed]]] = {}
     for plant in (case.plant, null.rough_plant):
         drives = case.drives(compile_plant(plant))
-        rig = Rig(plant, drives, [t.columns for t in case.tables])
+        rig = case.rig(plant, drives)
         for c in candidates(rig, entries):
             if c.effect.where != "sensor" or c.place.output in case.off:
                 starts.setdefault(c.key, []).append(_start(case, c))

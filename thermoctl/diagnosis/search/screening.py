@@ -53,7 +53,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     metric = Metric(plain, refitted.average, True)
     loud = max(over_noise(case, refitted)) > LOUD
     other = Metric(plain, refitted.average, False) if loud else None
-    rig = Rig(fitted.rough_plant, metric.drives, [t.columns for t in case.tables])
+    rig = case.rig(fitted.rough_plant, metric.drives)
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
     )
@@ -93,7 +93,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
 def places(case: Case) -> dict[str, set[str]]:
     """Return the places where each effect fits the plant. They share the effect's prior odds."""
     drives = case.drives(case.null.model)
-    rig = Rig(case.plant, drives, [t.columns for t in case.tables])
+    rig = case.rig(case.plant, drives)
     out: dict[str, set[str]] = {}
     for c in candidates(rig, case.catalogue):
         out.setdefault(c.effect.name, set()).add(c.place.where)

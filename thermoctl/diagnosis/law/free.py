@@ -1,0 +1,132 @@
+"""Free functions of a signal at each place: which signals a law may depend on, and whether one pays.
+
+A free function is a straight line between quantiles of the signal (`pieces`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.unknown import located, reached
+from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.law.forms import library
+from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
+from thermoctl.diagnosis.law.smooth import Tracked
+from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.search.beam import SPREAD
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+
+PIECES = 8  # number of knots of a free function of a signal
+# Number of hat functions of a flow in `pays`. It changed the answer in two of 40 cases, both near the limit.
+SKETCHED = 200
+NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
+RANKED = 40  # number of (place, signal) pairs whose free function is scored
+SEEN = 1e-6  # least singular value over the largest one; smaller ones are rounding errors
+
+
+def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
+    """Return whether a law may be worth its odds beside a hypothesis that leaves only noise.
+
+    Where a law fits much better than the hypothesis, a free function of a signal gains something there. At a
+    velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
+    off the gain. Raises SimulationError."""
+    refitted = as_refitted(case, f)
+    metric = Metric(Plain(case, f, ROWS), refitted.average, True)
+    linear = Tracked(metric, metric.residual, {}, resolved=SKETCHED)
+    rig = case.rig(f.rough_plant, metric.drives)
+    where = places(rig)
+    nodes = [p.target for p in where if p == Place(p.target)]
+    if len(nodes) > NODES:
+        nodes = located(case, refitted, reached(case))[:NODES]
+    combos = choices(rig, where, nodes, linear)
+    moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
+    both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
+    products = [(p, _along_both(linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
+    look, off = log_number(combos), cost_of(linear, PIECES) - cost_of(linear, 2)
+    gains = [gain + off for gain, *_ in ranked(linear, combos)[:1]]
+    gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
+    return SPREAD * max(gains, default=-np.inf) > look + unlikely(limits)
+
+
+def choices(
+    rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
+) -> list[tuple[Place, Signal]]:
+    """Return the places at some nodes, each with every signal that a law there may depend on."""
+    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.metric.signals)]
+
+
+def log_number(combos: Sequence[tuple[Place, Signal]]) -> float:
+    """Return the log of the number of places, signals and forms that a term is chosen from."""
+    return float(np.log(max(len(combos), 1)) + np.log(len(library())))
+
+
+def unlikely(limits: Thresholds) -> float:
+    """Return minus the log of the prior odds of one term."""
+    return -float(np.log(limits.missing / (1 - limits.missing) * limits.rare))
+
+
+def ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
+    """Return the predicted gain of a free function of a signal at each place, the best first."""
+    gains = _gains(linear, [(p, _free(linear, s)) for p, s in combos])
+    return [(gain, *combos[k]) for gain, k in gains]
+
+
+def _gains(
+    linear: Tracked, functions: Sequence[tuple[Place, Sequence[np.ndarray]]]
+) -> list[tuple[float, int]]:
+    """Return the predicted gain of each free function at its place, and its position, the best first.
+
+    Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
+    functions with the largest gain in energy, and only these are returned."""
+    scored = []
+    for k, (place, flows) in enumerate(functions):
+        x = linear.columns(place, flows)
+        scored.append((energy(x, linear.target), k, x))
+    scored.sort(key=lambda f: -f[0])
+    out = [(predicted(linear, x)[0] - cost_of(linear, x.shape[1]), k) for _, k, x in scored[:RANKED]]
+    return sorted(out, key=lambda f: -f[0])
+
+
+def _free(linear: Tracked, s: Signal) -> list[np.ndarray]:
+    """Return the columns (N, knots) of a free function of a signal by recording."""
+    values = linear.along(s.along)
+    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES)))
+    return [pieces(v, knots) for v in values]
+
+
+def _along_both(linear: Tracked, s: Signal, w: Signal) -> list[np.ndarray]:
+    """Return the columns of a free function of a signal times another one: its size, if the first drives."""
+    factors = linear.along(w.along)
+    return [
+        x * (np.abs(f) if s.drives else f)[:, None] for x, f in zip(_free(linear, s), factors, strict=True)
+    ]
+
+
+def cost_of(linear: Tracked, parameters: int) -> float:
+    """Return the nats that parameters cost: half the log of the number of rows each."""
+    return 0.5 * parameters * float(np.log(len(linear.target)))
+
+
+def energy(x: np.ndarray, target: np.ndarray) -> float:
+    """Return the part of |target|^2 that columns x explain."""
+    scale = np.linalg.norm(x, axis=0)
+    u, w, _ = np.linalg.svd(x / np.where(scale > 0, scale, 1.0), full_matrices=False)
+    return float(np.sum((u[:, w > SEEN * max(w[0], 1e-300)].T @ target) ** 2))
+
+
+def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Return hat functions of a signal between knots (N, knots): the columns of a free function."""
+    if len(knots) < 2:
+        return np.ones((len(v), 1))
+    return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
+
+
+def predicted(linear: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes."""
+    scale = np.linalg.norm(x, axis=0)
+    scale[scale == 0] = 1.0
+    c = np.linalg.lstsq(x / scale, linear.target, rcond=1e-8)[0] / scale
+    return linear.above(linear.target - x @ c), c
