@@ -160,6 +160,11 @@ RULES: Mapping[str, Rule] = {
         searches=True,
     ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
+    "pays": Rule(
+        "beside a best that leaves only noise, laws compete only where a free function pays for one",
+        {"law.contest.pays": lambda case, f, limits: True},
+        searches=True,
+    ),
     "laws": Rule(
         "laws compete", {"diagnose.with_laws": lambda case, found, limits, say: found}, searches=True
     ),
