@@ -1,4 +1,4 @@
-"""Free functions of a signal at each place: signals that a law may depend on, and whether a law may be there.
+"""Free functions of signals at each place: they show which signals a law may depend on.
 
 A free function is a straight line between quantiles of the signal (`pieces`)."""
 
