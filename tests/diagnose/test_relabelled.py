@@ -3,17 +3,20 @@
 import dataclasses
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from tests.checks.rigs import inputs, truth
 from tests.plants import TWO_BLOCKS
 from thermoctl.checks import checks
+from thermoctl.diagnosis.data.case import Budget, case, with_columns
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import absurd, relabelled
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 CLOSE = TWO_BLOCKS.replace("0.02, unit: W/K, range: [0.004, 0.08]", "0.2, unit: W/K, range: [0.04, 1]")
 RADIATES = CLOSE.replace(
@@ -43,6 +46,25 @@ def test_swapped_columns_are_told_from_physics(searched):
         finding.severe and f"'{ONE}' and '{TWO}' are swapped" in finding.what and "convection" in finding.what
     )
     assert finding.suggestion == f"If so: --columns {ONE}={TWO},{TWO}={ONE}"
+
+
+def test_columns_are_swapped_in_the_rows_that_were_diagnosed():
+    """Else the means of a long recording would be taken anew, and evidences of other rows would be compared."""
+    plant, slow = loads(CLOSE, "plant.yaml"), inputs("two blocks")
+    t = np.arange(0.0, 1600.0, 0.08)
+    long = Table("run_1", "run_1.csv", t, {k: np.repeat(v, 25) for k, v in slow.columns.items()})
+    table = compile_plant(truth(loads(RADIATES), 3)).measure(long, 3)
+
+    def swap(x):
+        """Return a recording with the two temperatures swapped."""
+        return dataclasses.replace(x, columns=x.columns | {ONE: x.columns[TWO], TWO: x.columns[ONE]})
+
+    for recorded, fits in ((table, False), (swap(table), True)):
+        known = case(plant, [recorded], catalogue((CATALOGUE,)), Budget(1))
+        again = with_columns(known, swap, Budget(1))
+        assert known.block > 1 and (again is not None) is fits
+        if again:
+            assert sorted(g.count.sum() for g in again.grids) == sorted(g.count.sum() for g in known.grids)
 
 
 @pytest.mark.parametrize(("gain", "refused"), [(1.79, True), (0.25, True), (1.1, False), (0.7, False)])
