@@ -126,7 +126,8 @@ def _sums(
         w = np.sqrt(weight[c.band])
         j = jac * w[:, None]
         gradient += j.T @ (w * row)
-        matrix += j.T @ j
+        with np.errstate(over="ignore", invalid="ignore"):  # the sensitivities of a run away from the data
+            matrix += j.T @ j
         if bands:
             starts = np.cumsum(c.count) - c.count
             by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))

@@ -188,6 +188,8 @@ def _bend(
         part = matrix[np.ix_(free, free)]
         weight = np.diag(part)
         out[free] = 0.5 * np.linalg.solve(part + damping * np.diag(weight), hill.bend(spot, step)[free])
-        if not weight @ out[free] ** 2 <= (0.5 * CURVED) ** 2 * (weight @ step[free] ** 2):
+        with np.errstate(over="ignore"):
+            small = weight @ out[free] ** 2 <= (0.5 * CURVED) ** 2 * (weight @ step[free] ** 2)
+        if not small:
             return np.zeros_like(step)
     return out

@@ -409,4 +409,5 @@ def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
         jac = jac * np.sqrt(weight)[:, None]
         lowered = lowered[:0]
     few = jac[lowered] * np.sqrt(1.0 - weight[lowered])[:, None]
-    return jac.T @ jac - few.T @ few
+    with np.errstate(over="ignore", invalid="ignore"):  # the sensitivities of a run away from the data
+        return jac.T @ jac - few.T @ few
