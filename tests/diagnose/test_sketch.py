@@ -12,7 +12,6 @@ from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search import again
 from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
@@ -31,7 +30,7 @@ def chain(tmp_path_factory):
     known = case(plant, read_recordings(plant, [folder / "run_1.csv"]), catalogue(), Budget(80))
     first = fitted(known, known.plant, (), known.null)
     metric = Metric(Plain(known, first, ROWS), first.average, False)
-    rig = Rig(first.rough_plant, metric.drives, [t.columns for t in known.tables])
+    rig = known.rig(first.rough_plant, metric.drives)
     found = candidates(rig, known.catalogue)
     return metric, rig, found, [Trajectory(metric, rig, 0)]
 
