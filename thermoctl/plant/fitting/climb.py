@@ -22,7 +22,10 @@ import numpy as np
 from thermoctl.plant.simulation.simulate import SimulationError
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e8  # first, least and largest damping
-EASED, RAISED = 0.2, 8.0  # factor on the damping after a step that gains half of its promise; after a failure
+# Factor on the damping after a step that gains half of its promise, and after a failure. Steps along a curved
+# valley are long only with little damping: 28 slow climbs of twelve bodies took 539 steps at 0.2, 292 at 0.04
+# and 250 at 0.01.
+EASED, RAISED = 0.02, 8.0
 TRIES = 12  # largest number of dampings that are tried for one step
 STRAIGHT = 0.75  # after a step that gains this share of its promise, the next one is not bent
 CURVED = 0.75  # largest acceleration, as a share of the step
