@@ -62,12 +62,13 @@ class Known:
         flat, sizes = np.concatenate(self.rows, axis=1), np.concatenate(self.sizes)
         found: list[Direction | None] = []
         known = [g for g in groups if self._columns(g) is not None]
-        at_once: list[Group] = []
+        at_once, count = list[Group](), 0
         for g in known:
             at_once.append(g)
-            if g is known[-1] or sum(len(g.sizes) for g in at_once) >= CHUNK:
+            count += len(g.sizes)
+            if g is known[-1] or count >= CHUNK:
                 found += self._scored(metric, flat, sizes, at_once)
-                at_once = []
+                at_once, count = [], 0
         kept = foremost_groups(known, found, KEPT)
         return [g for g in groups if self._columns(g) is None] + [known[i] for i in sorted(kept)]
 
