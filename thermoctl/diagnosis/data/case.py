@@ -21,7 +21,7 @@ from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
-from thermoctl.plant.fitting.cores import give_back
+from thermoctl.plant.fitting.cores import give_back, reuse_memory
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import Noise
@@ -189,6 +189,7 @@ def case(
 
     Rows of long recordings are averaged in blocks (rows.py).
     Raises InputError where too few values were measured."""
+    reuse_memory()
     plant, off, freed = _free_starts(plant, tables)
     fewer = reduced(plant, tables)
     tables = fewer.tables

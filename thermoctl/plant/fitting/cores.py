@@ -20,6 +20,9 @@ LEAST = (
 # Number of refits, or of chunks of directions, that run in parallel. The result depends on it, because a
 # refit ends early if it falls behind earlier ones. So it does not follow the number of cores.
 ABREAST = 2
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # options of malloc.h
+LARGE = 1 << 30  # bytes
+HALF_HEAP = 1 << 25  # bytes; older versions of glibc take no more for the second
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,6 +67,16 @@ def batches(queue: list[T], wanted: Callable[[T], bool]) -> Iterator[tuple[list[
         if batch:
             yield batch, len(queue) - position
             most = ABREAST
+
+
+def reuse_memory() -> None:
+    """Let the C library (glibc) use freed arrays again, until they are given back.
+
+    By default it returns each large array at once: the system then clears the same pages again and again."""
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option:
+        set_option(TRIM_THRESHOLD, LARGE)
+        set_option(MMAP_THRESHOLD, LARGE) or set_option(MMAP_THRESHOLD, HALF_HEAP)
 
 
 def give_back() -> None:
