@@ -36,10 +36,10 @@ def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[f
         return -8.0, 8.0
     if p.shape == "period":
         return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
+    if kind == "small_levels":  # the range is the level's prior: the same wherever the screening stood
+        return 0.0, direction.shape["most"]
     if p.shape == "level":
         reach = max(abs(value), 1e-9)
-        if kind == "small_levels":
-            return 0.0, 5 * reach
         return max(p.low, value - 3 * reach), value + 3 * reach
     if kind == "delays":
         return 0.0, max(value * 8, 0.05 * duration)
