@@ -1,4 +1,4 @@
-"""The time of a jump in a refit, and what a wrong one would leave to other names."""
+"""The time of a jump and the level of a cut in a refit, and what wrong ones would leave to other names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.plants import ONE_BLOCK
+from tests.plants import ONE_BLOCK, SPRING_STAGE
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.evidence.onsets import moved
@@ -56,3 +56,34 @@ def test_a_jump_that_is_in_place_stays(known):
     plant, effect = placed(known, TRUE - 0.5)
     f = fitted(known, plant, (effect,))
     assert moved(known, f.rough_plant, (effect,), f.rough) is None
+
+
+CUT = 0.11  # N
+
+
+@pytest.fixture
+def cut(tmp_path):
+    """A stage whose drive does nothing below 0.11 N, and all of it above."""
+    path, t = tmp_path / "plant.yaml", 0.002 * np.arange(4000.0)
+    path.write_text(SPRING_STAGE)
+    force = 0.5 * np.sin(2 * np.pi * (0.4 * t + 0.3 * t**2)) * np.random.default_rng(2).uniform(0, 1, 4000)
+    plant = compile_plant(load(path))
+    reached = plant.measure(Table("run", "run", t, {"force": force * (np.abs(force) >= CUT)}), seed=1)
+    return case(
+        load(path),
+        [dataclasses.replace(reached, columns={**reached.columns, "force": force})],
+        {},
+        Budget(20),
+    )
+
+
+@pytest.mark.parametrize("start", [0.02, 0.11, 0.4])
+def test_a_refit_finds_the_level_at_which_a_drive_is_cut_and_how_sure_it_is(cut, start):
+    rig = Rig(cut.plant, cut.drives(cut.null.model), [t.columns for t in cut.tables])
+    entry = catalogue((CATALOGUE,))["actuator_dead_zone"]
+    c = next(c for c in candidates(rig, {entry.name: entry}) if c.variant == 1)
+    effect = Placed(c, {"U": c.own("U")})
+    f = fitted(cut, c.extend({"U": start}, {"U": (1e-3, 0.6)}), (effect,))
+    level, sd = f.plant.parameters[effect.own["U"]].value, f.sd[effect.own["U"]]
+    assert abs(level - CUT) < 3 * sd + 0.01 * CUT
+    assert 0 < sd < 0.1 * CUT  # half the range, were its width the prior's

@@ -6,11 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.posterior import Posterior
+from thermoctl.diagnosis.evidence.onsets import UNSEEN
+from thermoctl.diagnosis.evidence.posterior import Posterior, Seen
+from thermoctl.plant.fitting.climb import Spot
 from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.simulation.simulate import SimulationError
 
 EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is at its bound
 MOST = 0.9  # largest share of the curvature that the unknown spectrum may remove
+# Steps of an unknown in 0..1 without slopes: the first one, the factor to the next, and the fall, nats, that
+# ends them.
+FIRST, LONGER, FALL = 1e-6, 3.0, 1.0
 
 
 def kept(h: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -56,3 +62,32 @@ def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
     share, p = np.linalg.eigh(0.5 * (inner + inner.T))
     left = root @ (p * (1 - np.clip(share, 0.0, MOST))) @ p.T @ root.T
     return left * np.outer(size, size)
+
+
+def without_slopes(posterior: Posterior, spot: Spot[Seen], matrix: np.ndarray) -> np.ndarray:
+    """Return the curvature (k,) of the log posterior by parameters of effects that have no slopes, else 0.
+
+    A level at which a signal is cut is such a parameter. The curvature follows from the steps on both sides
+    by which the log posterior falls by FALL and more; 0 if no step inside the bounds does."""
+    out = np.zeros(len(spot.z))
+    of_effects = {n for e in posterior.effects for n in e.own.values()}
+    for k, (q, _) in enumerate(posterior.problem.unknowns):
+        if q in of_effects and matrix[k, k] < UNSEEN:
+            out[k] = np.mean([_fall(posterior, spot, k, side) for side in (-1, 1)])
+    return out
+
+
+def _fall(posterior: Posterior, spot: Spot[Seen], k: int, side: int) -> float:
+    """Return twice the fall over the square of the first step of unknown k that falls by FALL."""
+    step, room = FIRST, (1 - spot.z[k] if side > 0 else spot.z[k])
+    while step < room:
+        z = spot.z.copy()
+        z[k] += side * step
+        try:
+            fall = spot.height - posterior.look(z, False).height
+        except SimulationError:
+            break
+        if fall >= FALL:
+            return float(2 * fall / step**2)
+        step *= LONGER
+    return 0.0

@@ -20,7 +20,7 @@ from scipy.special import chdtrc, chdtri
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.memory import Past, PlacedBefore
-from thermoctl.diagnosis.evidence.curvature import at_bound, deviations, kept, relieved
+from thermoctl.diagnosis.evidence.curvature import at_bound, deviations, kept, relieved, without_slopes
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.evidence.onsets import moved
 from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
@@ -42,7 +42,7 @@ DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise, from which the climb starts
 SHARE = 0.01  # share of an effect's size from which the first step towards its full size is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
-MOVES = 2  # largest number of refits after times of jumps were moved
+MOVES = 4  # largest number of refits after times or levels were moved
 TINY = 1e-300
 LOG_2PI = float(np.log(2 * np.pi))
 
@@ -307,6 +307,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
     own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = relieved(confined, posterior.relief(z, top.spot.found.rows, average))
+    confined += np.diag(without_slopes(posterior, top.spot, matrix))
     bounds = at_bound(problem, z)
     sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])

@@ -343,7 +343,7 @@ def _priors(
         if q in own:
             c, p = own[q]
             stated = c.effect.prior is not None and p.name in ex.names(c.effect.prior)
-            mean[k], precision[k] = 0.5, 1e-6 if stated else 1e-4
+            precision[k] = 1e-6 if stated else 1e-4  # about where the refit starts
             if (p.amplitude or c.effect.shapes.get(p.shape or "") == "delays") and not stated:
                 sizes[k] = own[q]
         elif q in case.plant.parameters:

@@ -36,8 +36,10 @@ def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[f
         return -8.0, 8.0
     if p.shape == "period":
         return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
-    if kind == "small_levels":  # the range is the level's prior: the same wherever the screening stood
-        return 0.0, direction.shape["most"]
+    if (
+        kind == "small_levels"
+    ):  # the prior is uniform over the log of this range, so that no level is preferred
+        return direction.shape["least"], direction.shape["most"]
     if p.shape == "level":
         reach = max(abs(value), 1e-9)
         return max(p.low, value - 3 * reach), value + 3 * reach

@@ -130,8 +130,8 @@ def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid
     z = z[np.isfinite(z)]
     if kind == "small_levels":
         top = float(np.max(np.abs(z))) or 1.0
-        most = 0.6 * top
-        return [{"level": float(v), "most": most} for v in np.geomspace(0.001 * top, most, 14)]
+        ends = {"least": 1e-4 * top, "most": 0.6 * top}
+        return [{"level": float(v), **ends} for v in np.geomspace(1e-3 * top, ends["most"], 14)]
     quantiles = [0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.99]
     if kind == "drive_levels":
         z, quantiles = np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]
