@@ -30,12 +30,16 @@ class Curve:
 def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory or of a storage. The free function is the law plus a fit to its residual."""
+    None for a law with a memory or of a storage, and for one of a signal that the plant without it lacks: a
+    lag of a sensor found beside it makes such signals. The free function is the law plus a fit to its
+    residual."""
     signals = [s for t in p.terms for s in t.signals]
     if not signals or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
     s = signals[0]
     parameters = {q: v.value for q, v in plant.parameters.items()}
+    if not ex.names(rate) <= {*linear.metric.signals[0], *parameters, "t"}:
+        return None
     values = linear.along(s.along)
     flows = linear.along(lambda run, t: ex.series(rate, {**run, **parameters}, t))
     knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES + 4)))
