@@ -97,7 +97,7 @@ def test_laplace_agrees_with_importance_sampling(name):
     hessian = posterior.slope(found.fit.z, rows, found.average.inverse)[1]
     spread = np.linalg.inv(hessian + 1e-9 * np.eye(len(found.fit.z)))
     draw = multivariate_t(found.fit.z, 1.5 * spread, df=6, seed=5)
-    z = draw.rvs(300).reshape(300, -1)
+    z = draw.rvs(3000).reshape(3000, -1)  # a valley needs thousands
     low, high = posterior.bounds
     inside = np.all((z >= low) & (z <= high), axis=1)
 
