@@ -26,12 +26,12 @@ from thermoctl.diagnosis.evidence.onsets import moved
 from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
 from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
+from thermoctl.diagnosis.evidence.starts import beside_parent, first_point
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant.fitting import refit
-from thermoctl.plant.fitting.climb import Climbed, bounded_step
+from thermoctl.plant.fitting.climb import Climbed
 from thermoctl.plant.fitting.estimate import updated
 from thermoctl.plant.fitting.refit import Fit
-from thermoctl.plant.fitting.residuals import Evaluation, Problem
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -40,7 +40,6 @@ UNIFORM = 12.0  # precision of a uniform prior over 0..1
 PERIODS = 15.0  # range of all possible periods over the range that a refit gives a period (logarithms)
 DECADES = 4.0  # width of the log-uniform prior of an effect's size
 WHITE, ROUGH = 12, 0.1  # iterations and tolerance of the refit in white noise, from which the climb starts
-SHARE = 0.01  # share of an effect's size from which the first step towards its full size is taken
 HOPELESS = 50.0  # a refit ends early if it would stay this many nats below the best hypothesis
 MOVES = 4  # largest number of refits after times or levels were moved
 TINY = 1e-300
@@ -189,12 +188,12 @@ def _refitted(
     parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
-        led, there = _led(posterior, parent.rough.cost if parent else np.inf)
+        first, there = first_point(posterior, parent.rough.cost if parent else np.inf)
         start = refit.fit(
             posterior.model,
             posterior.drives,
             case.noise,
-            start=led,
+            start=first,
             there=there,
             iterations=WHITE,
             tolerance=ROUGH,
@@ -208,94 +207,11 @@ def _refitted(
     top = posterior.climb(z, goal)
     if parent and top.spot.found.average.log_likelihood < parent.log_likelihood:
         try:
-            other = posterior.climb(_beside(posterior, parent), goal)
+            other = posterior.climb(beside_parent(posterior, parent.hypothesis.keys, parent.fit), goal)
         except SimulationError:
             other = top
         top = max(top, other, key=lambda t: t.spot.height)
     return _weighed(case, posterior, top, start)
-
-
-def _beside(posterior: Posterior, parent: Fitted) -> np.ndarray:
-    """Return the unknowns at the parent's maximum, with a small share of each effect that it lacks."""
-    problem, plant = posterior.problem, posterior.plant.parameters
-    small = {
-        e.own[p.name]: p.null + SHARE * (plant[e.own[p.name]].value - p.null)
-        for e in posterior.effects
-        if e.key not in parent.hypothesis.keys
-        for p in e.candidate.effect.parameters
-        if e.own.get(p.name) in plant and p.fades(e.candidate.effect.shapes)
-    }
-    z = problem.start(small)
-    place = {unknown: k for k, unknown in enumerate(problem.unknowns)}
-    for unknown, value in zip(parent.fit.unknowns, parent.fit.z, strict=True):
-        if unknown in place:
-            z[place[unknown]] = value
-    z[posterior.shared] = posterior.past.z
-    return z
-
-
-def _led(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evaluation | None]:
-    """Return the unknowns from which a refit starts, and their evaluation; None if it failed.
-
-    They are the effects at full size, if these improve the fit. The plant's own parameters may have imitated
-    the effect. Then at full size the cost is above `parent`, the cost of the refit without the effect. In
-    that case one Gauss-Newton step is taken from a small share of the effect. Sizes and the plant's
-    parameters change in this step, shapes do not. The refit starts at full size, at the small share or after
-    the step, whichever has the least cost."""
-    problem = posterior.problem
-    full = problem.start({})
-    starts = [(full, _evaluated(problem, full))]
-    plant = posterior.plant.parameters
-    names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.sizes.items() if p.amplitude}
-    if _cost(starts[0]) < parent or not names:
-        return starts[0]
-    small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
-    own = {n for e in posterior.effects for n in e.own.values()}
-    free = np.array([k for k, (q, _) in enumerate(problem.unknowns) if q not in own or q in names])
-    try:
-        now = problem.evaluate(small, True)
-        led = _along_values(posterior, small, now, free)
-    except SimulationError:
-        return starts[0]
-    starts += [(small, now), (led, _evaluated(problem, led))]
-    return min(starts, key=_cost)
-
-
-def _evaluated(problem: Problem, z: np.ndarray) -> Evaluation | None:
-    try:
-        return problem.evaluate(z, False)
-    except SimulationError:
-        return None
-
-
-def _cost(start: tuple[np.ndarray, Evaluation | None]) -> float:
-    return start[1].cost if start[1] else float("inf")
-
-
-def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np.ndarray) -> np.ndarray:
-    """Return z after one Gauss-Newton step of the unknowns `free`, linear in the values of the parameters.
-
-    A parameter that an effect replaces goes towards zero. On its logarithmic scale it could not get there."""
-    problem = posterior.problem
-    values, _ = problem.unpack(z)
-    low, high = (bound - z for bound in posterior.bounds)
-    current, slope = z.copy(), np.ones(len(z))
-    for k, (q, r) in enumerate(problem.unknowns[: problem.n_parameters]):
-        scale = problem.scales[q]
-        current[k] = float(values[r or 0, posterior.model.parameters.index(q)])
-        slope[k] = scale.slope(current[k])
-        low[k], high[k] = (scale.low - current[k]) / slope[k], (scale.high - current[k]) / slope[k]
-    zero = np.zeros(len(free))
-    part, bounds = now.matrix[np.ix_(free, free)], (low[free], high[free])
-    step, _ = bounded_step(zero, now.gradient[free], part, 0.0, bounds)
-    out = z.copy()
-    for k, change in zip(free, step, strict=True):
-        if k < problem.n_parameters:
-            scale = problem.scales[problem.unknowns[k][0]]
-            out[k] = scale.z(float(np.clip(current[k] + slope[k] * change, scale.low, scale.high)))
-        else:
-            out[k] = z[k] + change
-    return out
 
 
 def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
