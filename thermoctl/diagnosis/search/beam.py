@@ -17,17 +17,15 @@ from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
-from thermoctl.diagnosis.search.extend import extend, sticking, weaker
-from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
 from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
-from thermoctl.diagnosis.search.screen import Norms, sharpened
+from thermoctl.diagnosis.search.refits import free_starts, refitted
+from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
-from thermoctl.diagnosis.search.shortlist import HALF, PAIR, Extension, shortlist, simpler
+from thermoctl.diagnosis.search.shortlist import HALF, Extension, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
-from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting import refit
-from thermoctl.plant.fitting.cores import LEAST, batches, each
+from thermoctl.plant.fitting.cores import batches
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
@@ -45,7 +43,6 @@ BEATEN = 10.0
 # Share of the hypotheses near the best that will be extended, for the time left that the progress states.
 CLOSE = 0.5
 Keys = frozenset[Key]
-START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
 @dataclass(frozen=True)
@@ -350,7 +347,9 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         untried = (left + len(batch)) / len(queue)
         case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits, untried))
         case.budget.planned = case.budget.fits_done + left + len(batch)
-        for (added, gain), fits in zip(batch, _abreast(case, parent, looked, batch, leader), strict=True):
+        for (added, gain), fits in zip(
+            batch, refitted(case, parent.fitted, looked, batch, leader), strict=True
+        ):
             found = [f for f in fits if not f.absent]
             best_gain = max((s.weighed(f).score for f in fits), default=-np.inf) - parent.score
             ratio = max(ratio, best_gain / max(gain, 1.0)) if np.isfinite(gain) else ratio
@@ -389,61 +388,3 @@ def _expected(
         return np.inf
     scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
     return CLOSE * sum(score >= scores[0] - NEAR for score in scores)
-
-
-def _abreast(
-    case: Case, parent: Weighed, looked: Screened, batch: Sequence[Extension], leader: Fitted
-) -> list[list[Fitted]]:
-    """Refit a batch of extensions in parallel; return the refits of each."""
-    starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
-    return each(lambda first: _followed(case, parent, looked, first, leader), starts, len(batch) * LEAST)
-
-
-def _followed(
-    case: Case, parent: Weighed, looked: Screened, first: Sequence[Direction], leader: Fitted
-) -> list[Fitted]:
-    """Refit the parent with the directions from several starting points, which depend on their shapes.
-
-    If every refit fits worse than the parent, start again from a weaker effect."""
-    stuck = tuple(sticking(d) or d for d in first)
-    found = [_refitted(case, parent, first, looked, leader)]
-    if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:
-        found.append(_refitted(case, parent, stuck, looked, leader))
-    if all(f is None or f.rough.cost > parent.fitted.rough.cost for f in found):
-        found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
-    return [f for f in found if f is not None]
-
-
-def _refitted(
-    case: Case, parent: Weighed, added: Sequence[Direction], looked: Screened, leader: Fitted
-) -> Fitted | None:
-    effects, plant = parent.fitted.hypothesis.effects, parent.fitted.rough_plant
-    drives = looked.metric.drives
-    try:
-        for d in added:
-            rig = case.rig(plant, drives)
-            d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
-            inputs = plant.inputs.keys()
-            plant, own = extend(plant, d, drives)
-            if not own:  # an earlier effect replaced the place it acts on, so that it would change nothing
-                return None
-            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
-                drives = case.drives(compile_plant(plant))
-            effects = (*effects, Placed(d.candidate, own))
-        return fitted(case, free_starts(parent.fitted.plant, plant), effects, None, leader, parent.fitted)
-    except (SimulationError, InputError, np.linalg.LinAlgError):
-        return None
-
-
-def free_starts(before: Plant, after: Plant) -> Plant:
-    """Widen the initial states of bodies that an effect added: nobody measured where they start.
-
-    A node into which nothing flows is none: it holds a reading of the start."""
-    moving = {end for f in after.flows.values() if f.rate is not ex.ZERO for end in (f.source, f.target)}
-    nodes = {
-        n.name: n
-        if n.name in before.nodes or n.name not in moving or not n.initial_sigma
-        else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
-        for n in after.nodes.values()
-    }
-    return dataclasses.replace(after, nodes=nodes)
