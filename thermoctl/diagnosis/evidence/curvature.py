@@ -67,8 +67,8 @@ def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
 def without_slopes(posterior: Posterior, spot: Spot[Seen], matrix: np.ndarray) -> np.ndarray:
     """Return the curvature (k,) of the log posterior by parameters of effects that have no slopes, else 0.
 
-    A level at which a signal is cut is such a parameter. The curvature follows from the steps on both sides
-    by which the log posterior falls by FALL and more; 0 if no step inside the bounds does."""
+    A level at which a signal is cut is such a parameter. On each side the first step counts by which the
+    log posterior falls by FALL and more."""
     out = np.zeros(len(spot.z))
     of_effects = {n for e in posterior.effects for n in e.own.values()}
     for k, (q, _) in enumerate(posterior.problem.unknowns):

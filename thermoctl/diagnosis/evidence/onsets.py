@@ -21,14 +21,14 @@ ONSETS = 24  # number of onset times in a screening's grid over the recordings
 FINER = 4  # each grid is finer than the one before by this factor
 GAIN = 6.0  # least decrease of the squared errors over the noise to move one: three nats
 UNSEEN = 1.0  # curvature by an unknown in 0..1 that says nothing about it
-RATIO, FINEST = 1.64, 1.01  # of neighbouring levels in a screening's grid, and in the finest one here
+RATIO, FINEST = 1.64, 1.01  # ratio of neighbouring levels in a screening's grid, and in the finest one here
 
 
 def moved(case: Case, plant: Plant, effects: Sequence[Placed], fit: Fit) -> Plant | None:
     """Return the plant with better times and levels, and no other change; None if no others fit better.
 
-    Each is searched on finer and finer grids about it, from the screening's step to half a sample, or to the
-    ratio FINEST of a level."""
+    Each is searched on finer and finer grids about it, from the screening's step on. The finest has a step of
+    half a sample, or of levels the ratio FINEST."""
     kinds = {e.own.get(p.name): p.shape for e in effects for p in e.candidate.effect.parameters}
     own = {q: k for k, (q, r) in enumerate(fit.unknowns) if r is None and q in kinds}
     times = {q: k for q, k in own.items() if kinds[q] in TIMES}

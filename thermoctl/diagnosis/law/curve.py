@@ -30,9 +30,9 @@ class Curve:
 def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory or of a storage, and for one of a signal that the plant without it lacks: a
-    lag of a sensor found beside it makes such signals. The free function is the law plus a fit to its
-    residual."""
+    None for a law with a memory or of a storage. None, too, if the plant without it lacks one of its signals:
+    a lag of a sensor that was found beside it makes such signals. The free function is the law plus a fit to
+    its residual."""
     signals = [s for t in p.terms for s in t.signals]
     if not signals or p.place.part != "flow" or any(t.form.memory for t in p.terms):
         return None
