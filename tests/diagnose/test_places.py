@@ -146,6 +146,16 @@ def test_a_reading_of_the_start_is_no_body_whose_start_nobody_measured(motor):
     assert widened == pytest.approx(10 * hidden.nodes[body].initial_sigma)
 
 
+def test_a_slow_sensor_measures_where_it_starts_itself(motor):
+    """Ten times the spread cost a lag 2.3 nats a recording against the delay that fits as well."""
+    _, table = motor
+    plant = loads(MOTOR.replace("initial: air}", "initial: air, initial_sigma: 0.2}"))
+    place, lag = next(iter(offered(plant, table, "sensor_lag").items()))
+    slow = lag.extend({"TAU": 5.0})
+    (sensor,) = slow.nodes.keys() - plant.nodes.keys()
+    assert free_starts(plant, slow).nodes[sensor].initial_sigma == pytest.approx(0.2), place
+
+
 TANK = """format: thermoctl-plant/1
 title: A tank that drains
 inputs: {inflow: {unit: m^3/s}}

@@ -70,11 +70,13 @@ def _refitted(
 def free_starts(before: Plant, after: Plant) -> Plant:
     """Widen the initial states of bodies that an effect added: nobody measured where they start.
 
-    A node into which nothing flows is none: it holds a reading of the start."""
+    A node into which nothing flows is none: it holds a reading of the start. Nor is a slow sensor's, which an
+    output reads alone: its spread is that of the true value."""
     moving = {end for f in after.flows.values() if f.rate is not ex.ZERO for end in (f.source, f.target)}
+    read = [ex.names(o.value) & after.nodes.keys() for o in after.outputs.values()]
     nodes = {
         n.name: n
-        if n.name in before.nodes or n.name not in moving or not n.initial_sigma
+        if n.name in before.nodes or n.name not in moving or {n.name} in read or not n.initial_sigma
         else dataclasses.replace(n, initial_sigma=START * n.initial_sigma)
         for n in after.nodes.values()
     }
