@@ -7,7 +7,7 @@ import threading
 
 from tests.diagnose.test_workers import rig
 from thermoctl.diagnosis.run import diagnose
-from thermoctl.diagnosis.search import beam as search
+from thermoctl.diagnosis.search import refits
 from thermoctl.plant.fitting import cores
 
 
@@ -24,7 +24,7 @@ def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
             return side_by_side(lambda x: (seen.add(threading.get_ident()), f(x))[1], items, numbers)
 
         with monkeypatch.context() as patch:
-            patch.setattr(search, "each", each)
+            patch.setattr(refits, "each", each)
             diagnose(plant, tables, tmp_path / f"out{n}")
         threads.append(len(seen))
         found = json.loads((tmp_path / f"out{n}" / "diagnosis.json").read_text())
