@@ -36,9 +36,7 @@ def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[f
         return -8.0, 8.0
     if p.shape == "period":
         return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
-    if (
-        kind == "small_levels"
-    ):  # the prior is uniform over the log of this range, so that no level is preferred
+    if kind == "small_levels":  # uniform over its log: the prior does not follow where the screening stood
         return direction.shape["least"], direction.shape["most"]
     if p.shape == "level":
         reach = max(abs(value), 1e-9)
