@@ -299,7 +299,8 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     write(run, "t,force,encoder", rows)
     r = diagnosed([plant, run], tmp_path / "out")
     # friction that differs with direction, which contains it, is tried too and keeps some probability
-    assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "explained"
+    (found,) = r["findings"]
+    assert found["effect"] == "coulomb_friction" and found["probability"] > 0.8
     assert {a["effect"] for a in r["alternatives"]} <= {"directional_friction"}
     assert not any("backlash" in e for h in r["hypotheses"] for e in h["effects"])
 

@@ -36,7 +36,7 @@ def above(whole: Coordinates, inverse: Sequence[np.ndarray], screened: Coordinat
 def fine(
     metric: Metric, trajectories: Sequence[Trajectory], c: Candidate, upper: Sequence[Upper]
 ) -> list[Direction]:
-    """Return the best direction of a reading's error among the periods that its spectrum picked, if any."""
+    """Return the best direction of a reading's periodic error, if any."""
     if not c.place.output or "periods" not in c.effect.shapes.values():
         return []
     j = list(c.rig.plant.outputs).index(c.place.output)
@@ -51,11 +51,10 @@ def fine(
     residual = rows([d.y[:, j] - run.y[:, j] for d, run in zip(metric.drives, metric.runs, strict=True)])
     best: dict[int, Direction] = {}
     for g in groups_of(c, metric):
-        if "picked_from" in g.sizes[0][0]:
-            columns = list(g.columns())
-            changed = [
-                [q.changes(at)[1].get(j, np.zeros(len(at.drive.t))) for q in columns] for at in trajectories
-            ]
-            d = rows([np.stack(part, axis=1) for part in changed])
-            score(columns, d, d.T @ residual, np.linalg.norm(d, axis=0), best)
+        columns = list(g.columns())
+        changed = [
+            [q.changes(at)[1].get(j, np.zeros(len(at.drive.t))) for q in columns] for at in trajectories
+        ]
+        d = rows([np.stack(part, axis=1) for part in changed])
+        score(columns, d, d.T @ residual, np.linalg.norm(d, axis=0), best)
     return [dataclasses.replace(d, vector=None) for d in best.values() if d.gain > 0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
-from thermoctl.diagnosis.evidence.levels import over_noise
+from thermoctl.diagnosis.evidence.levels import PRESENT, over_noise
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.again import Known
@@ -46,13 +46,15 @@ class Screened:
 def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened:
     """Screen the catalogue at the places of the original plant. Parts that an effect added are no places.
 
-    Where the residual is far above the noise, screen a second time with that noise alone: by energy.
+    Where the residual is far above the noise, or a remainder may hide a slow effect, screen a second time
+    with that noise alone.
     `known`: the first screening, which fills it; a later one may simulate few directions (again.py)."""
     refitted = as_refitted(case, fitted)
     plain = Plain(case, fitted, ROWS)
     metric = Metric(plain, refitted.average, True)
     loud = max(over_noise(case, refitted)) > LOUD
-    other = Metric(plain, refitted.average, False) if loud else None
+    slow = max(refitted.average.remainder) >= PRESENT
+    other = Metric(plain, refitted.average, False) if loud or slow else None
     rig = case.rig(fitted.rough_plant, metric.drives)
     added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
         case.plant.nodes.keys() | case.plant.flows.keys()
@@ -87,7 +89,8 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     picked = (d for c in placed for d in fine(metric, trajectories, c, upper))
     promised += [(d, 0.5 * d.gain - float(np.log(10)) * d.elsewhere) for d in picked]
     promised.sort(key=lambda x: -x[1])
-    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], other, by_energy, norms)
+    energy, by_energy = (other, by_energy) if loud else (None, [])
+    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], energy, by_energy, norms)
 
 
 def places(case: Case) -> dict[str, set[str]]:
