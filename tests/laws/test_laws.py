@@ -31,9 +31,10 @@ from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, la
 from thermoctl.diagnosis.law.refit import law_of as placed_law
 from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect
 from thermoctl.diagnosis.law.signals import Place, Signal, signals
-from thermoctl.diagnosis.law.smooth import _explained, tracked
+from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
@@ -165,6 +166,24 @@ def test_parameters_that_scale_together_absorb_no_flow():
     at = tracked(known, fitted(known, known.plant, (), known.null), ["broth", "substrate"])
     share = {n: _explained(x, at.target) for n, x in at.free.items()}
     assert share["broth"] > 0.5 > share["substrate"]
+
+
+def test_the_response_to_a_law_is_that_of_the_plant_with_it_however_fast_it_moves():
+    """Hat functions, 400 over a recording, did not resolve a stage that vibrates: a motor with two gains was drag."""
+    plant, t = loads(SPRING_STAGE), np.arange(0, 20, 0.0005)
+    force = 8.0 * np.sin(2 * np.pi * 7.0 * t)
+    table = compile_plant(plant).measure(Table("run", "", t, {"force": force}), 1)
+    known = case(plant, [table], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    metric = Metric(Plain(known, null, ROWS), null.average, False)
+    own, size = metric.signals[0], 1e-3
+    q = np.abs(own["force"]) * np.tanh(own["velocity"] / 1e-3)
+    more = Flow("more", ex.parse(f"{size} * abs(force) * tanh(velocity / 0.001)"), "velocity", None)
+    with_it = compile_plant(replace(null.rough_plant, flows={**null.rough_plant.flows, "more": more}))
+    moved = with_it.run(known.drives(with_it)[0], dx0=null.rough.dx0[0]).y - metric.runs[0].y
+    truth = metric.project(metric.rows(0, moved / -size))
+    (found,) = Tracked(metric, metric.residual, {}).columns(Place("velocity"), [q[:, None]]).T
+    assert np.linalg.norm(found - truth) < 0.05 * np.linalg.norm(truth)
 
 
 @pytest.mark.parametrize(("visited", "relays"), [((1.0, 1.0, 1.0), 0), ((0.0, 0.5, 1.0), 1)])

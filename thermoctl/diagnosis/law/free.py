@@ -20,8 +20,6 @@ from thermoctl.diagnosis.search.beam import SPREAD
 from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
 
 PIECES = 8  # number of knots of a free function of a signal
-# Number of hat functions of a flow in `pays`. It changed the answer in two of 40 cases, both near the limit.
-SKETCHED = 200
 NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
 RANKED = 40  # number of (place, signal) pairs whose free function is scored
 SEEN = 1e-6  # least singular value over the largest one; smaller ones are rounding errors
@@ -35,7 +33,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     off the gain. Raises SimulationError."""
     refitted = as_refitted(case, f)
     metric = Metric(Plain(case, f, ROWS), refitted.average, True)
-    linear = Tracked(metric, metric.residual, {}, resolved=SKETCHED)
+    linear = Tracked(metric, metric.residual, {})
     rig = case.rig(f.rough_plant, metric.drives)
     where = places(rig)
     nodes = [p.target for p in where if p == Place(p.target)]

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import block_diag, solveh_banded
+from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
 from thermoctl.diagnosis.data.case import Case
@@ -26,7 +26,7 @@ from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnosis.law.signals import Place, Values
-from thermoctl.diagnosis.search.metric import ROWS, Absorbed, Metric, Plain
+from thermoctl.diagnosis.search.metric import ROWS, Absorbed, Metric, Plain, Pushed
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.fitting.residuals import Problem
@@ -40,7 +40,6 @@ FEWEST_KNOTS = 24
 ABSORBED = 1e-3  # a flow is absorbed if the projection leaves less than this share of its response's norm
 STEPS = 6  # largest number of Gauss-Newton steps of the tracking
 TOGETHER = 48  # number of responses that are simulated at a time
-RESOLVED = 400  # number of hat functions of a flow; 90 % of responses in a stage and in tanks err by < 0.7 %
 
 
 @dataclass
@@ -50,15 +49,12 @@ class Tracked:
     - `metric`: whitened rows at the trajectory, and the projection
     - `target` (rows,): the misfit that a law has to explain
     - `free`: by node, the responses (rows, k) to a free flow in time into it, each knot's of typical size
-    - `beyond`: directions that a free flow into another node absorbs, or None
-    - `resolved`: number of hat functions of a flow"""
+    - `beyond`: directions that a free flow into another node absorbs, or None"""
 
     metric: Metric
     target: np.ndarray
     free: dict[str, np.ndarray]
     beyond: Absorbed | None = None
-    resolved: int = RESOLVED
-    _units: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @property
     def likely(self) -> list[str]:
@@ -78,19 +74,28 @@ class Tracked:
     def columns(self, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
         """Return the whitened, projected responses (rows, k) to flows (N, k), by recording, at a place.
 
-        They are sums of the responses to hat functions. A storage that is larger by q acts like the
-        flow -q dx/dt into the node. A flow that the plant's own parameters absorb gives zeros."""
+        A storage that is larger by q acts like the flow -q dx/dt into the node. A flow that the plant's own
+        parameters absorb gives zeros."""
         if place.part == "storage":
             flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
-        units = [self._unit(n) for n in reversed(place.nodes)]
+        some = [[q[:, k : k + TOGETHER] for q in flows] for k in range(0, flows[0].shape[1], TOGETHER)]
         with np.errstate(all="ignore"):
-            fine = [_fitted_hats(h, q) for h, q in zip(self._hats, flows, strict=True)]
-            into, *out = [np.concatenate([b @ c for b, c in zip(u, fine, strict=True)]) for u in units]
-            whole = into - out[0] if out else into
+            parts = [self.metric.responses(partial(self._pushed, place, q), q[0].shape[1]) for q in some]
+            whole = np.concatenate(parts, axis=1) * self.metric.weight[:, None]
             rest = self.metric.project(whole)
             rest = self.beyond.without(rest) if self.beyond else rest
             absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
+
+    def _pushed(self, place: Place, flows: Sequence[np.ndarray], r: int) -> Pushed:
+        """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
+        model, t = self.metric.model, self.metric.drives[r].t
+        forces, q = list[tuple[int, int]](), []
+        for k, node in enumerate(reversed(place.nodes)):
+            storage = ex.series(model.plant.nodes[node].storage, self.metric.signals[r], t)
+            forces += [(model.states.index(node), c) for c in range(flows[r].shape[1])]
+            q.append((-1) ** k * np.nan_to_num(flows[r]) / storage[:, None])
+        return Pushed(forces, np.concatenate(q, axis=1), {})
 
     def flows(self, nodes: Sequence[str]) -> tuple[float, float]:
         """Return the log marginal likelihood of free flows into nodes, over that of none, and their size.
@@ -107,10 +112,6 @@ class Tracked:
         beyond = Absorbed.by(size * self.free[node])
         return dataclasses.replace(self, target=beyond.without(self.target), beyond=beyond)
 
-    @cached_property
-    def _hats(self) -> list[csr_matrix]:
-        return [hat_functions(d.t, min(self.resolved, len(d.t))) for d in self.metric.drives]
-
     def _slopes(self, node: str) -> list[np.ndarray]:
         """Return the slope dx/dt of a node (N,) by recording, without the part of the unknown flow.
 
@@ -123,12 +124,6 @@ class Tracked:
             return np.asarray(np.gradient(np.asarray(run[node], float), t) - unknown)
 
         return self.along(slope)
-
-    def _unit(self, node: str) -> list[np.ndarray]:
-        """Return, by recording, the rows of the responses to hat functions of flow into a node."""
-        if node not in self._units:
-            self._units[node] = flow_rows(self.metric, node, self._hats)
-        return self._units[node]
 
 
 def _gain(share: float, square: np.ndarray, force: np.ndarray) -> float:
@@ -308,13 +303,6 @@ def hat_functions(t: np.ndarray, knots: int) -> csr_matrix:
     part = (t - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
     entries = np.concatenate([n, n]), np.concatenate([k, k + 1])
     return csr_matrix((np.concatenate([1 - part, part]), entries), shape=(len(t), knots))
-
-
-def _fitted_hats(hats: csr_matrix, flows: np.ndarray) -> np.ndarray:
-    """Return the weights (knots, k) of hat functions (N, knots) that fit flows (N, k) by least squares."""
-    square = (hats.T @ hats).tocsr()
-    bands = np.stack([np.concatenate([[0.0], square.diagonal(1)]), square.diagonal()])
-    return solveh_banded(bands, hats.T @ np.nan_to_num(flows), check_finite=False)
 
 
 def _smoothed(
