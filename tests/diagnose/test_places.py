@@ -87,7 +87,30 @@ def test_a_period_that_has_not_come_twice_is_not_offered():
     start = {p.name: p.null for p in found.effect.parameters}
     for shape in grid:
         direction = Direction(found, shape, 1.0, 2, {**start, "P": shape["period"]})
-        assert ranges_of(direction, 8.0)["P"][1] <= 1.001 * travel / 2
+        ranges = ranges_of(direction, 8.0)
+        assert ranges["P"][1] <= 1.001 * travel / 2
+        assert np.ptp(ranges["PHI"]) == pytest.approx(2 * np.pi)
+
+
+@pytest.mark.parametrize("zero", [0.0, 273.15])
+def test_the_prior_of_a_limit_depends_on_what_the_signal_visits_and_not_on_the_zero_of_its_unit(motor, zero):
+    """It was three times the level: a limit of a temperature in K had 2.3 nats less than the same in degC."""
+    plant, table = motor
+    plant = loads(MOTOR.replace("value: winding, unit: degC", f"value: winding + {zero}, unit: degC"))
+    model = compile_plant(plant)
+    (found, *_) = candidates(
+        Rig(plant, [drive := model.excitation(table)], [table.columns]), entries("sensor_saturation")
+    )
+    runs = [model.run(drive)]
+    spans = {
+        ranges_of(Direction(found, shape, 1.0, 1, {"YMAX": shape["level"]}), 3000.0)["YMAX"]
+        for shape in shape_grid("end_levels", found, runs)
+    }
+    y = runs[0].y[:, 0] - zero
+    ((low, high),) = spans
+    assert (low - zero, high - zero) == pytest.approx(
+        (y.min() - np.ptp(y) / 2, y.max() + np.ptp(y) / 2), rel=1e-3
+    )
 
 
 def jumping(motor, column: str) -> tuple[Plant, Table]:

@@ -33,14 +33,11 @@ def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[f
     if p.shape in TIMES:
         return (0.0, duration) if value <= duration else None
     if p.shape == "phase":
-        return -8.0, 8.0
+        return value - np.pi, value + np.pi
     if p.shape == "period":
         return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
-    if kind == "small_levels":  # uniform over its log: the prior does not follow where the screening stood
-        return direction.shape["least"], direction.shape["most"]
-    if p.shape == "level":
-        reach = max(abs(value), 1e-9)
-        return max(p.low, value - 3 * reach), value + 3 * reach
+    if p.shape == "level":  # the prior must not follow where the screening stood
+        return max(p.low, direction.shape["least"]), direction.shape["most"]
     if kind == "delays":
         return 0.0, max(value * 8, 0.05 * duration)
     if p.shape:

@@ -51,7 +51,8 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onse
     """Return the values of a shape that a screening tries.
 
     A value may hold `picked_from`, the number of values from which the residual itself picked it. A period
-    holds `longest`, the longest period that repeats in the recordings."""
+    holds `longest`, the longest period that repeats in the recordings. A level holds `least` and `most`, the
+    ends of its prior."""
     if kind in ("onsets", "windows", "times", "lags", "delays"):
         return _times(kind, candidate.rig.duration, candidate.rig.sample, onsets)
     if kind in ("periods", "phases", "distances"):
@@ -137,8 +138,10 @@ def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid
         z, quantiles = np.abs(z), [0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98]
     if kind == "end_levels" and candidate.variant == 1:
         quantiles = [1 - q for q in quantiles]
+    half = 0.5 * float(np.ptp(z))  # a fit without the limit may have kept the signal inside it
+    ends = {"least": float(np.min(z)) - half, "most": float(np.max(z)) + half}
     end = float(np.quantile(z, round(quantiles[-1])))
     levels = np.quantile(z, quantiles)
     # The signal may exceed the last quantile only in one pulse.
     beyond = levels[-1] + np.array(BEYOND) * (end - levels[-1])
-    return [{"level": float(v)} for v in np.unique([*levels, *beyond])]
+    return [{"level": float(v), **ends} for v in np.unique([*levels, *beyond])]
