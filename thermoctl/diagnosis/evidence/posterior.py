@@ -9,7 +9,7 @@ is simulated, and its sums are added.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -168,6 +168,9 @@ class Posterior:
         self.shared = np.array([place[q] for q in self.past.unknowns], int)
         self.mean[self.shared], precision[self.shared] = self.past.z, 0.0
         self.precision = np.diag(precision)
+        for k, behind in _behind(case, self.problem, plant):
+            self.precision += np.outer(behind, behind)
+            self.precision[k, k] -= 1.0
         self.precision[np.ix_(self.shared, self.shared)] = self.past.precision
         beliefs = [b for e in effects for b in e.candidate.beliefs(plant)]
         self.problem.priors = tuple(beliefs)
@@ -349,6 +352,36 @@ def _priors(
         elif q in case.plant.parameters:
             mean[k] = problem.scales[q].z(case.plant.parameters[q].value)
     return sizes, mean, precision
+
+
+def _behind(case: Case, problem: Problem, plant: Plant) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the start of each slow sensor that an effect added, and by how much it is behind at the start.
+
+    The first is an unknown. The second is a row (unknowns,): the true value less the reading, over its
+    standard deviation. In the sensor's time constant the true value changes by about that time times its
+    typical slope."""
+    place = {u: k for k, u in enumerate(problem.unknowns)}
+    values = {q: p.value for q, p in plant.parameters.items()}
+    interval = float(np.median(np.diff(problem.excitations[0].t)))
+    for name, g in zip(case.measured, case.grids, strict=True):
+        read = ex.names(plant.outputs[name].value) & plant.nodes.keys()
+        sensor = min(read - case.plant.nodes.keys(), default="")
+        rates = [ex.undelayed(f.rate) for f in plant.flows.values() if f.target == sensor]
+        if len(read) != 1 or len(rates) != 1:
+            continue
+        storage = plant.nodes[sensor].storage
+        slopes = {n: ex.derivative(rates[0], n) for n in ex.names(rates[0]) & plant.nodes.keys()}
+        if not all(ex.names(s) <= values.keys() for s in (storage, *slopes.values())):
+            continue
+        change = g.change * g.block**1.5 / interval * float(ex.evaluate(storage, values))
+        for r in range(len(problem.excitations)):
+            row = np.zeros(len(place))
+            for n, slope in slopes.items():
+                if (k := place.get((f"{n} at the start", r))) is not None:
+                    sigma = problem.sigma0[k - problem.n_parameters]
+                    row[k] = float(ex.evaluate(slope, values)) * sigma / change
+            if (k := place.get((f"{sensor} at the start", r))) is not None:
+                yield k, row
 
 
 def gaussian(posterior: Posterior) -> np.ndarray:

@@ -94,12 +94,16 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
 
 
 def places(case: Case) -> dict[str, set[str]]:
-    """Return the places where each effect fits the plant. They share the effect's prior odds."""
+    """Return the places of the plant that share each effect's prior odds.
+
+    Recorded inputs take no share of an effect that has other places: a fault there is `rare`."""
     drives = case.drives(case.null.model)
-    rig = case.rig(case.plant, drives)
+    found = candidates(case.rig(case.plant, drives), case.catalogue)
+    usual = {c.effect.name for c in found if not c.place.input}
     out: dict[str, set[str]] = {}
-    for c in candidates(rig, case.catalogue):
-        out.setdefault(c.effect.name, set()).add(c.place.where)
+    for c in found:
+        if not c.place.input or c.effect.name not in usual:
+            out.setdefault(c.effect.name, set()).add(c.place.where)
     return out
 
 
