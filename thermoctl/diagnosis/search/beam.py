@@ -89,6 +89,7 @@ class Search:
     promised: dict[Key, float] = field(default_factory=dict)  # largest first-order gain of a placed effect
     known: Known = field(default_factory=Known)  # rows of the first screening
     refused: dict[Keys, str] = field(default_factory=dict)  # refits that are no hypotheses: why
+    like: dict[Keys, Weighed] = field(default_factory=dict)  # refused, but contains a simpler entry
 
     @property
     def best(self) -> Weighed:
@@ -101,6 +102,14 @@ class Search:
             keys = w.fitted.hypothesis.keys
             if keys not in self.tried or w.score > self.tried[keys].score:
                 self.tried[keys] = w
+
+    def refuse(self, keys: Keys, fits: Sequence[Fitted]) -> None:
+        """Note that refits may be no hypotheses, and the likeliest that contains a simpler entry."""
+        self.refused[keys] = INSIGNIFICANT if fits else FAILED
+        there = (f for f in fits if not f.absent)
+        likeliest = max(there, key=lambda f: f.log_evidence, default=None)
+        if likeliest and any(e.candidate.effect.contains for e in likeliest.hypothesis.effects):
+            self.like[keys] = self.weighed(likeliest)
 
     def extended(self, parent: Weighed) -> list[Weighed]:
         """Extend a hypothesis, once."""
@@ -145,7 +154,15 @@ def search(case: Case, limits: Thresholds) -> Searched:
 
 
 def searched(s: Search) -> Searched:
-    """Return the result of a search."""
+    """Return the result of a search.
+
+    The data do not tell an entry from one that contains it and whose other part may be nothing. So this
+    one is kept, too, at most as likely."""
+    for keys, w in s.like.items():
+        for e in w.fitted.hypothesis.effects:
+            simpler = s.tried.get(keys - {e.key} | {(e.candidate.effect.contains or "", e.key[1])})
+            if simpler and keys not in s.tried:
+                s.tried[keys] = Weighed(w.fitted, min(w.log_odds, simpler.score - w.fitted.log_evidence))
     order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
     refused = {keys: why for keys, why in s.refused.items() if keys not in s.tried}
     return Searched(
@@ -354,7 +371,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
             best_gain = max((s.weighed(f).score for f in fits), default=-np.inf) - parent.score
             ratio = max(ratio, best_gain / max(gain, 1.0)) if np.isfinite(gain) else ratio
             keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-            s.refused[keys] = INSIGNIFICANT if fits else FAILED
+            s.refuse(keys, fits)
             if found:
                 best = max(found, key=lambda f: f.log_evidence)
                 (doubtful if best.doubtful else out).append(s.weighed(best))
