@@ -35,9 +35,8 @@ SURPLUS = 5.0  # nats by which an extension with an insignificant part must be a
 # If the residual of the best is only noise, a hypothesis so many nats below is not refitted nor extended.
 # It has a hundredth of the probability.
 NEAR = 4.6
-SPREAD = (
-    1.15  # largest ratio of a gain to its prediction beside noise, over those before: 45 refits of 14 cases
-)
+# Largest ratio of a gain to its prediction beside noise, over those before: 45 refits of 14 cases.
+SPREAD = 1.15
 # Nats below the best, from which a law is left out; for each effect allowed, also an earlier hypothesis.
 BEATEN = 10.0
 # Share of the hypotheses near the best that will be extended, for the time left that the progress states.
@@ -187,12 +186,10 @@ def grow(s: Search) -> None:
         rounds = s.limits.effects - number - 1
         for k, parent in enumerate(beam):
             after = [w for w in beam[k + 1 :] if not close or w.score >= best - NEAR]
-            follows = (
-                s.limits.beam if len(s.tried) == 1 and rounds else 0
-            )  # beside the plant alone none is known
-            s.case.budget.later = (
-                CLOSE * (len(after) + follows) if close else len(after) + rounds * s.limits.beam
-            )
+            # beside the plant alone none is known
+            follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
+            left = CLOSE * (len(after) + follows) if close else len(after) + rounds * s.limits.beam
+            s.case.budget.later = left
             if close and parent.score < best - NEAR:
                 continue
             known = parent.fitted.hypothesis.keys in s.seen
