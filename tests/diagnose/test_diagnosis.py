@@ -299,7 +299,7 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     write(run, "t,force,encoder", rows)
     r = diagnosed([plant, run], tmp_path / "out")
     # those that contain it, with another part too small to show, keep some probability, and are a family
-    assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"]
+    assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "ambiguous"
     assert r["families"][0]["probability"] > 0.95
     assert {a["effect"] for a in r["alternatives"]} == {
         "backlash_hysteresis",

@@ -374,6 +374,8 @@ def _behind(case: Case, problem: Problem, plant: Plant) -> Iterator[tuple[int, n
         if not all(ex.names(s) <= values.keys() for s in (storage, *slopes.values())):
             continue
         change = g.change * g.block**1.5 / interval * float(ex.evaluate(storage, values))
+        if change <= 0:  # a true value at rest says nothing about how far the sensor is behind
+            continue
         for r in range(len(problem.excitations)):
             row = np.zeros(len(place))
             for n, slope in slopes.items():

@@ -157,13 +157,14 @@ def searched(s: Search) -> Searched:
 
     The data do not tell an entry from one that contains it and whose other part may be nothing. So this
     one is kept, too, at most as likely."""
+    tried = dict(s.tried)
     for keys, w in s.like.items():
         for e in w.fitted.hypothesis.effects:
             simpler = s.tried.get(keys - {e.key} | {(e.candidate.effect.contains or "", e.key[1])})
-            if simpler and keys not in s.tried:
-                s.tried[keys] = Weighed(w.fitted, min(w.log_odds, simpler.score - w.fitted.log_evidence))
-    order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
-    refused = {keys: why for keys, why in s.refused.items() if keys not in s.tried}
+            if simpler and keys not in tried:
+                tried[keys] = Weighed(w.fitted, min(w.log_odds, simpler.score - w.fitted.log_evidence))
+    order = tuple(sorted(tried.values(), key=lambda w: -w.score))
+    refused = {keys: why for keys, why in s.refused.items() if keys not in tried}
     return Searched(
         order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
     )
