@@ -52,20 +52,24 @@ static int row_at(const Model *m, double t) {         /* the last row not after 
   return low;
 }
 
-/* Slope of column c at row k, as numpy.gradient; at the newest row of three or more the parabola's. */
-static double row_slope(const Model *m, int k, int c) {
-  const double *q = m->past + (size_t)k * ROW;
-  int n = m->kept - 1;
-  if (n == 0) return 0;
-  if (k == 0) return (q[ROW + c] - q[c]) / (q[ROW] - q[0]);
-  double before = (q[c] - q[c - ROW]) / (q[0] - q[-ROW]);
-  if (k == n) {
-    if (n == 1) return before;
-    double older = (q[c - ROW] - q[c - 2 * ROW]) / (q[-ROW] - q[-2 * ROW]);
-    return before + (before - older) * (q[0] - q[-ROW]) / (q[0] - q[-2 * ROW]);
+/* Slope of column c from row k to the next; beyond the rows the lines go on bending. */
+static double line_slope(const Model *m, int k, int c) {
+  int last = m->kept - 2, near = k < 0 ? 0 : last;
+  if (k >= 0 && k <= last) {
+    const double *q = m->past + (size_t)k * ROW;
+    return (q[ROW + c] - q[c]) / (q[ROW] - q[0]);
   }
-  double h = q[0] - q[-ROW], g = q[ROW] - q[0];
-  return (h * h * q[ROW + c] + (g * g - h * h) * q[c] - g * g * q[c - ROW]) / (h * g * (h + g));
+  if (last < 1) return last < 0 ? 0 : line_slope(m, 0, c);
+  double at = line_slope(m, near, c), bend = near ? at - line_slope(m, near - 1, c) : line_slope(m, 1, c) - at;
+  return at + (k - near) * bend;
+}
+
+/* Slope of column c at row k, after Akima (J. ACM 17 (1970) 589): of the two lines that meet, the one that bends less counts more. */
+static double row_slope(const Model *m, int k, int c) {
+  double first = line_slope(m, k - 2, c), before = line_slope(m, k - 1, c);
+  double after = line_slope(m, k, c), last = line_slope(m, k + 1, c);
+  double bend = fabs(first - before), turn = fabs(last - after), both = bend + turn;
+  return both > 0 ? (turn * before + bend * after) / both : 0.5 * (before + after);
 }
 
 /* Column c at time t: cubic between rows, held before the start. */

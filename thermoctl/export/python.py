@@ -84,6 +84,7 @@ Written by `thermoctl plant export --to python` (thermoctl {__version__}). Needs
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.interpolate import Akima1DInterpolator
 
 PARAMETERS = {{{_parameters(plant, numbers)}}}
 INPUTS = {list(inputs)!r}
@@ -165,7 +166,8 @@ def simulate(t, inputs, parameters=None, first=None, rtol=1e-10):
         u.append(np.append(mean, mean[-1]))
     u = np.array(u).reshape(len(u), len(t))
     x = _integrate(t, u, np.array(LINEAR + DELAYED_LINEAR, bool), initial(u[:, 0], p, start), p, rtol)
-    d = [_earlier(t, np.broadcast_to(g, t.shape), max(s, 0.0)) for g, s in output_delays(t, x, u, p, WIDTHS)]
+    past = [(np.broadcast_to(g, t.shape), np.maximum(t - max(s, 0.0), 0.0)) for g, s in output_delays(t, x, u, p, WIDTHS)]
+    d = [Akima1DInterpolator(t, g)(at) for g, at in past]
     y = outputs(t, x, u, p, WIDTHS, d)
     return {**dict(zip(STATES, x)), **dict(zip(OUTPUTS, y))}
 
@@ -192,16 +194,4 @@ def _integrate(t, u, linear, x0, p, rtol):
             raise RuntimeError(f"the plant cannot be integrated beyond t = {t[a]:g} s: {run.message}")
         x[:, a : b + 1] = run.y
     return x
-
-
-def _earlier(t, g, seconds):
-    """Return g (N,) seconds earlier: cubic between samples, held before the start."""
-    at = np.maximum(t - seconds, t[0])
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    h, rate = t[k + 1] - t[k], np.gradient(g, t)
-    s = (at - t[k]) / h
-    return (
-        (1 + 2 * s) * (1 - s) ** 2 * g[k] + s * (1 - s) ** 2 * h * rate[k]
-        + s * s * (3 - 2 * s) * g[k + 1] + s * s * (s - 1) * h * rate[k + 1]
-    )
 '''

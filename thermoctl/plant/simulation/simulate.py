@@ -16,6 +16,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
 from thermoctl.plant.simulation.compile import Code, machine_code
+from thermoctl.plant.simulation.earlier import earlier
 from thermoctl.plant.simulation.sensor import error
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
@@ -487,31 +488,14 @@ class Model:
     def _shift(
         self, t: np.ndarray, g: np.ndarray, dg: np.ndarray | None, p: np.ndarray, own: int
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the arguments of delays, seconds earlier.
-
-        Cubic between samples (Catmull-Rom slopes), held before the start."""
+        """Return the arguments of delays, seconds earlier, and their changes."""
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
         for j, (_, seconds) in enumerate(self.code.output_delays.values()):
             td = max(float(ex.evaluate(seconds, known)), 0.0)
-            at = np.maximum(t - td, t[0])
-            k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-            h = t[k + 1] - t[k]
-            s = (at - t[k]) / h
-            basis = (
-                (1 + 2 * s) * (1 - s) ** 2,
-                s * (1 - s) ** 2 * h,
-                s * s * (3 - 2 * s),
-                s * s * (s - 1) * h,
-            )
-            rate = np.gradient(g[:, j], t)
-            out[:, j] = (
-                basis[0] * g[k, j] + basis[1] * rate[k] + basis[2] * g[k + 1, j] + basis[3] * rate[k + 1]
-            )
-            if dg is not None and dout is not None:
-                w = s[:, None]
-                dout[:, j] = (1 - w) * dg[k, j] + w * dg[k + 1, j]
-                slope = np.where(t - td > t[0], (1 - s) * rate[k] + s * rate[k + 1], 0.0)
+            out[:, j], slope, changes = earlier(t, g[:, j], td, None if dg is None else dg[:, j])
+            if dout is not None:
+                dout[:, j] = changes
                 for c, q in enumerate(self.active if own else ()):
                     if q in ex.names(seconds):
                         dout[:, j, c] -= slope * float(ex.evaluate(ex.derivative(seconds, q), known))
