@@ -181,23 +181,30 @@ def started(case: Case, limits: Thresholds) -> Search:
 def grow(s: Search) -> None:
     """Extend the beam until none of its extensions is better."""
     for number in range(s.limits.effects):
-        beam = leaders(list(s.tried.values()), s.limits)
-        best = beam[0].score
-        close = only_noise(s.case, beam[0].fitted, s.limits)
+        first, *others = leaders(list(s.tried.values()), s.limits)
+        # one effect more may make such a hypothesis the better one
+        fewer = [w for w in others if _number(w) < _number(first)]
+        if close := only_noise(s.case, first.fitted, s.limits):
+            near = first.score - NEAR
+            others = [w for w in others if w.score >= near or _number(w) < _number(first)]
         rounds = s.limits.effects - number - 1
-        for k, parent in enumerate(beam):
-            after = [w for w in beam[k + 1 :] if not close or w.score >= best - NEAR]
-            # beside the plant alone none is known
-            follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
-            left = CLOSE * (len(after) + follows) if close else len(after) + rounds * s.limits.beam
+        # beside the plant alone none is known
+        follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
+        known = first.fitted.hypothesis.keys in s.seen
+        parents = [first, *others]
+        while parents:
+            parent, *parents = parents
+            left = CLOSE * (len(parents) + follows) if close else len(parents) + rounds * s.limits.beam
             s.case.budget.later = left
-            if close and parent.score < best - NEAR:
-                continue
-            known = parent.fitted.hypothesis.keys in s.seen
-            if not s.extended(parent) and parent is beam[0] and not known:
-                break  # the best cannot be extended: no rival with more effects is needed
-        if s.best.score <= best or s.case.budget.spent:
+            if not s.extended(parent) and parent is first and not known:
+                parents = fewer  # the best cannot be extended: no rival with more effects is needed
+        if s.best.score <= first.score or s.case.budget.spent:
             break
+
+
+def _number(w: Weighed) -> int:
+    """Return the number of effects of a hypothesis."""
+    return len(w.fitted.hypothesis.effects)
 
 
 def swap(s: Search) -> None:
