@@ -64,6 +64,10 @@ def _nothing(*a: Any) -> Any:
     return ()
 
 
+def _none(*a: Any) -> list[Any]:
+    return []
+
+
 def _no(*a: Any) -> bool:
     return False
 
@@ -125,7 +129,7 @@ RULES: Mapping[str, Rule] = {
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
     ),
     "unasked": Rule(
-        "where nothing is asked of other parts, the log evidence counts half", limits={"unasked": 1.0}
+        "where nothing is asked of other parts, the log evidence counts less", limits={"unasked": 1.0}
     ),
     "floor": Rule("an error far below the noise is luck", {"verdict.confirm.FLOOR": 1e-6}),
     "draws": Rule("a smooth error counts as few draws", {"verdict.confirm._draws": _all}),
@@ -137,6 +141,11 @@ RULES: Mapping[str, Rule] = {
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
         {"diagnose.flow_missing": lambda *a: Missing()},
+    ),
+    "pairs": Rule(
+        "two effects that explain far more together than alone are refitted together",
+        {"search.shortlist.pairs": _none},
+        searches=True,
     ),
     "swap": Rule(
         "each effect of the best meets rivals in its place", {"search.beam.swap": _nothing}, searches=True

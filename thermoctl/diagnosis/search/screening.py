@@ -29,15 +29,17 @@ ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
 class Screened:
     """The catalogue's best directions; `promises`: predicted gain in log likelihood of each.
 
-    `energy`: the rows whitened by the sensors' noise alone; `by_energy`: all directions, sorted by their
-    gain there. Where the plant has a large error, a first-order step predicts the log likelihood badly, and
-    this gain in energy is a better guide. Both are empty where the residual is not LOUD. `norms`: of all
-    columns; empty where not all were simulated."""
+    `every`: the best direction of each candidate, with its vector. `energy`: the rows whitened by the
+    sensors' noise alone; `by_energy`: all directions, sorted by their gain there. Where the plant has a large
+    error, a first-order step predicts the log likelihood badly, and this gain in energy is a better guide.
+    Both are empty where the residual is not LOUD. `norms`: of all columns; empty where not all were
+    simulated."""
 
     metric: Metric
     rig: Rig
     directions: list[Direction]
     promises: list[float]
+    every: list[Direction]
     energy: Metric | None
     by_energy: list[Direction]
     norms: list[Norms]
@@ -90,7 +92,9 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     promised += [(d, 0.5 * d.gain - float(np.log(10)) * d.elsewhere) for d in picked]
     promised.sort(key=lambda x: -x[1])
     energy, by_energy = (other, by_energy) if loud else (None, [])
-    return Screened(metric, rig, [d for d, _ in promised], [p for _, p in promised], energy, by_energy, norms)
+    return Screened(
+        metric, rig, [d for d, _ in promised], [p for _, p in promised], best, energy, by_energy, norms
+    )
 
 
 def places(case: Case) -> dict[str, set[str]]:

@@ -77,7 +77,8 @@ def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Threshold
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
     First are those with the largest predicted gain, the best first. Then come those with the largest gain in
-    energy, then pairs, both with an infinite gain. Each list has at most PLACES_EACH places of one effect."""
+    energy, then pairs. The gain of a proposal by energy is infinite. At most PLACES_EACH places of an effect
+    are listed alone."""
     worthwhile = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = predicted(d, promise, where, limits)
@@ -86,13 +87,15 @@ def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Threshold
     worthwhile.sort(key=lambda x: -x[1])
     gains = {d.candidate.key: gain for d, gain in reversed(worthwhile)}
     best = foremost(once(d for d, _ in worthwhile), PLACES_EACH)[: limits.shortlist]
-    out = [((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > worthwhile[0][1]]
+    out: list[Extension] = [
+        ((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > worthwhile[0][1]
+    ]
     listed = {d.candidate.key for (d,), _ in out}
     out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in listed]
-    together = pairs([d for d, _ in worthwhile], looked.metric, limits)
+    out += pairs(looked.every, looked.metric, where, limits)
     if looked.energy:
-        together += pairs(looked.by_energy, looked.energy, limits)
-    return [*out, *((p, np.inf) for p in together)]
+        out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
+    return out
 
 
 def largest(looked: Screened) -> list[Direction]:
@@ -102,15 +105,19 @@ def largest(looked: Screened) -> list[Direction]:
     return [dataclasses.replace(d, vector=None) for d in best]
 
 
-def pairs(directions: Sequence[Direction], metric: Metric, limits: Thresholds) -> list[tuple[Direction, ...]]:
+def _constant(c: Candidate) -> bool:
+    """Return whether an entry is physics that does not happen at one moment, and new to the plant."""
+    return not any(kind in EVENTS for kind in c.effect.shapes.values()) and not relabels(c)
+
+
+def pairs(
+    directions: Sequence[Direction], metric: Metric, where: Mapping[str, set[str]], limits: Thresholds
+) -> list[Extension]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
-    The plant's own parameters may imitate each effect of a pair alone, but not both together."""
-    kept = once(
-        d
-        for d in directions
-        if d.vector is not None and not any(kind in EVENTS for kind in d.candidate.effect.shapes.values())
-    )
+    The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
+    joint gain has to outweigh their prior odds."""
+    kept = [d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate)]
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
@@ -119,16 +126,20 @@ def pairs(directions: Sequence[Direction], metric: Metric, limits: Thresholds) -
     # size of the first beside the second, along its unit vector
     first = (g[:, None] - c * g[None]) / (1 - c**2)
     joint = g[:, None] * first + g[None] * first.T
+    own = np.array([odds((Placed(d.candidate, {}),), where, limits) for d in kept])
     alone = np.array([d.gain for d in kept])
     extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
-    out: list[tuple[Direction, ...]] = []
-    for k in np.argsort(-extra, axis=None):
+    worth = (extra > np.maximum.outer(alone, alone)) & (0.5 * joint + np.add.outer(own, own) > 0)
+    out: list[Extension] = []
+    for k in np.argsort(np.where(worth, -extra, 0.0), axis=None, kind="stable")[: int(worth.sum())]:
         a, b = np.unravel_index(k, extra.shape)
-        if len(out) >= limits.shortlist // PAIR or extra[a, b] <= max(alone[a], alone[b]):
-            break
         pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
         if all(d is not None for d in pair):
-            out.append(tuple(d for d in pair if d is not None))
+            left = metric.residual - first[a, b] * v[a] - first[b, a] * v[b]
+            promise = metric.around.rise(metric.powers(left))
+            out.append((tuple(d for d in pair if d is not None), float(promise + own[a] + own[b])))
+        if len(out) >= limits.shortlist // PAIR:
+            break
     return out
 
 
