@@ -591,6 +591,8 @@ def evaluate(
 
     `values`: name to number or array; `first(name)` serves first(); `width(argument)` is the half width over
     which a jump is smoothed (0: a true jump)."""
+    if not expr.args:  # most starts and many rates are one name or number
+        return _value(expr, [], values, first, width)
     done: dict[int, Any] = {}
     with np.errstate(all="ignore"):
         for e in walk(expr):

@@ -165,6 +165,8 @@ class Problem:
                 self.columns[r, len(model.active) + c] = len(self.unknowns)
                 self.unknowns.append((f"{s} at the start", r))
                 self.sigma0.append(model.plant.nodes[s].initial_sigma or 1.0)
+        self.at = [model.parameters.index(q) for q in model.active]
+        self.fixed = np.array([model.vector(None, d.name) for d in self.excitations])
 
     def start(self, changes: Mapping[str, float]) -> np.ndarray:
         """Return the unknowns (scaled) at the plant's values, with changes."""
@@ -192,25 +194,18 @@ class Problem:
 
     def unpack(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return values (recordings, parameters) and shifts of initial states (recordings, states)."""
-        values = np.array([self.model.vector(None, d.name) for d in self.excitations])
-        dx0 = np.zeros((len(self.excitations), len(self.model.uncertain)))
-        for r in range(len(self.excitations)):
-            for c in range(self.columns.shape[1]):
-                k = self.columns[r, c]
-                if k < 0:
-                    continue
-                if c < len(self.model.active):
-                    q = self.model.active[c]
-                    values[r, self.model.parameters.index(q)] = self.scales[q].value(z[k])
-                else:
-                    dx0[r, c - len(self.model.active)] = z[k] * self.sigma0[k - self.n_parameters]
-        return values, dx0
+        n, first = self.n_parameters, len(self.model.active)
+        named = (self.scales[q].value(x) for (q, _), x in zip(self.unknowns, z[:n], strict=False))
+        own = np.array([*named, *(z[n:] * self.sigma0), np.nan])[self.columns]
+        values, known = self.fixed.copy(), self.columns >= 0
+        values[:, self.at] = np.where(known[:, :first], own[:, :first], values[:, self.at])
+        return values, np.where(known[:, first:], own[:, first:], 0.0)
 
     def alone(self, r: int) -> Problem:
         """Return the problem of one recording, with the same numbers of the unknowns; it has no priors."""
         other = copy.copy(self)
         other.excitations, other.whitening = [self.excitations[r]], [self.whitening[r]]
-        other.columns, other.priors = self.columns[r : r + 1], ()
+        other.columns, other.fixed, other.priors = self.columns[r : r + 1], self.fixed[r : r + 1], ()
         other.buffers, other.kept_buffers, other.held = {}, {}, []
         return other
 

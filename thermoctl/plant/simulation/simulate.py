@@ -115,6 +115,12 @@ class Model:
         self.states, self.outputs, self.uncertain = code.states, code.outputs, code.uncertain
         self.unknowns = (*self.active, *(f"{n} at the start" for n in self.uncertain))
         self._initial = [n.initial for n in plant.nodes.values()]
+        self._initial_slopes = [
+            (i, c, ex.derivative(e, q))
+            for i, e in enumerate(self._initial)
+            for c, q in enumerate(self.active)
+            if q in ex.names(e)
+        ]
         self._slots = [self.states.index(n) for n in self.uncertain]
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process compiles the plant itself
@@ -242,11 +248,8 @@ class Model:
             ]
         )
         s0 = np.zeros((len(self.states), len(self.unknowns)))
-        for i, e in enumerate(self._initial):
-            used = ex.names(e)
-            for c, q in enumerate(self.active):
-                if q in used:
-                    s0[i, c] = float(ex.evaluate(ex.derivative(e, q), values, first))
+        for i, c, slope in self._initial_slopes:
+            s0[i, c] = float(ex.evaluate(slope, values, first))
         for c, slot in enumerate(self._slots):
             s0[slot, len(self.active) + c] = 1.0
             if dx0 is not None:
