@@ -23,7 +23,7 @@ from thermoctl.plant.simulation.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # ratio of a band's ends: a quarter of an octave
-SHORT = 4_000  # up to so many samples a DCT is fast for any number of them
+SHORT = 500  # up to so many samples no DCT takes long
 FEWEST = 8  # an output with fewer measured samples in a recording is not used there
 
 
@@ -75,10 +75,9 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     index = measured(d.y[:, j])
     if len(index) < FEWEST:
         return None
-    if quick(len(index)) < len(index):
-        index = index[: quick(len(index))]
     block = max(1, len(index) // (2 * most)) if most else 1
-    n = len(index) // block
+    n = quick(len(index) // block)
+    index = index[: n * block]
     rows = min(n, most or n)
     edges, count, band = _bands(rows)
     middle = 0.5 * (edges[:-1] + edges[1:] - 1)
@@ -106,14 +105,22 @@ def transform(c: Channel, e: np.ndarray) -> np.ndarray:
 
 
 def transforms(channels: Sequence[Channel], e: np.ndarray) -> np.ndarray:
-    """Return the rows (rows, ...) of a recording's channels, in turn, from its values (N, outputs, ...).
+    """Return the rows (rows, ...) of a recording's channels, in turn, from its values (N, outputs, ...)."""
+    return np.concatenate(rows_of_each(channels, e))
 
-    Channels of the same samples are summed over their blocks at once: that is several times faster."""
-    first = channels[0]
-    if not all(c.block == first.block and np.array_equal(c.index, first.index) for c in channels):
-        return np.concatenate([transform(c, e[:, c.output]) for c in channels])
+
+def rows_of_each(channels: Sequence[Channel], e: np.ndarray) -> list[np.ndarray]:
+    """Return the rows (rows, ...) of each of a recording's channels from its values (N, outputs, ...).
+
+    Channels of the same samples are summed over their blocks at once: that is several times faster. Single
+    values are transformed at once, too."""
+    first = channels[0] if channels else None
+    if not first or any(c.block != first.block or not np.array_equal(c.index, first.index) for c in channels):
+        return [transform(c, e[:, c.output]) for c in channels]
     sums = _blocks(first, e)
-    return np.concatenate([_dct(sums[:, c.output], c.rows) for c in channels])
+    if sums.ndim == 2:
+        return list(np.ascontiguousarray(_dct(sums[:, [c.output for c in channels]], first.rows).T))
+    return [_dct(sums[:, c.output], c.rows) for c in channels]
 
 
 def _dct(e: np.ndarray, rows: int) -> np.ndarray:

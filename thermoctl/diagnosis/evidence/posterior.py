@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.data.coordinates import Channel, transform
+from thermoctl.diagnosis.data.coordinates import Channel, rows_of_each, transform
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
@@ -184,7 +184,9 @@ class Posterior:
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Transform samples (N, outputs, ...) of each recording to DCT rows (rows, ...) of each channel."""
-        return [transform(c, e[c.recording][:, c.output]) for c in self.case.coordinates.channels]
+        return [
+            x for channels, part in zip(self.channels, e, strict=True) for x in rows_of_each(channels, part)
+        ]
 
     def likelihood(self, rows: Sequence[np.ndarray]) -> tuple[Averaged, list[np.ndarray]]:
         """Return the averaged likelihood of the residuals' DCT rows, and their powers by band."""
