@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
+from itertools import accumulate, repeat, takewhile
+from operator import mul
 
 import numpy as np
 
@@ -78,16 +81,24 @@ def without_slopes(posterior: Posterior, spot: Spot[Seen], matrix: np.ndarray) -
 
 
 def _fall(posterior: Posterior, spot: Spot[Seen], k: int, side: int) -> float:
-    """Return twice the fall over the square of the first step of unknown k that falls by FALL."""
-    step, room = FIRST, (1 - spot.z[k] if side > 0 else spot.z[k])
-    while step < room:
+    """Return twice the fall over the square of the first step of unknown k that falls by FALL.
+
+    The log posterior falls the more, the longer the step: so the step is found by bisection."""
+    room = 1 - spot.z[k] if side > 0 else spot.z[k]
+    steps = list(takewhile(lambda step: step < room, accumulate(repeat(LONGER), mul, initial=FIRST)))
+    falls = dict[float, float]()
+
+    def ends(step: float) -> bool:
+        """Return whether a step falls by FALL, or cannot be simulated."""
         z = spot.z.copy()
         z[k] += side * step
         try:
-            fall = spot.height - posterior.look(z, False).height
+            falls[step] = spot.height - posterior.look(z, False).height
         except SimulationError:
-            break
-        if fall >= FALL:
-            return float(2 * fall / step**2)
-        step *= LONGER
-    return 0.0
+            falls[step] = np.inf
+        return falls[step] >= FALL
+
+    first = bisect_left(steps, True, key=ends)
+    if first == len(steps) or np.isinf(falls[steps[first]]):
+        return 0.0
+    return float(2 * falls[steps[first]] / steps[first] ** 2)
