@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
-from thermoctl.diagnosis.search.gains import Direction, score
+from thermoctl.diagnosis.search.gains import Column, Direction, score
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import groups_of
 
+TOGETHER = 16  # number of periods whose columns are transformed at a time: one by one takes twice as long
 # A channel of all samples, and the weights of its rows: 0 for the rows that the screening has.
 Upper = tuple[Channel, np.ndarray]
 
@@ -50,11 +52,18 @@ def fine(
 
     residual = rows([d.y[:, j] - run.y[:, j] for d, run in zip(metric.drives, metric.runs, strict=True)])
     best: dict[int, Direction] = {}
-    for g in groups_of(c, metric):
-        columns = list(g.columns())
-        changed = [
-            [q.changes(at)[1].get(j, np.zeros(len(at.drive.t))) for q in columns] for at in trajectories
-        ]
-        d = rows([np.stack(part, axis=1) for part in changed])
-        score(columns, d, d.T @ residual, np.linalg.norm(d, axis=0), best)
+    groups = groups_of(c, metric)
+    for some in (groups[k : k + TOGETHER] for k in range(0, len(groups), TOGETHER)):
+        each = [list(g.columns()) for g in some]
+        columns = list(chain.from_iterable(each))
+        d = rows([_changed(columns, at, j) for at in trajectories])
+        edges = np.cumsum([len(one) for one in each])[:-1]
+        for one, x in zip(each, np.split(d, edges, axis=1), strict=True):
+            score(one, x, x.T @ residual, np.linalg.norm(x, axis=0), best)
     return [dataclasses.replace(d, vector=None) for d in best.values() if d.gain > 0]
+
+
+def _changed(columns: Sequence[Column], at: Trajectory, j: int) -> np.ndarray:
+    """Return the changes (N, columns) of output j along a trajectory."""
+    nothing = np.zeros(len(at.drive.t))
+    return np.stack([q.changes(at)[1].get(j, nothing) for q in columns], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -61,15 +62,10 @@ def foremost(directions: Iterable[Direction], places: int) -> list[Direction]:
 
 def log_p(gain: float, dims: int) -> float:
     """Return log10 of the chi-square tail probability, also where that is too small for a float."""
-    return float(_log_p(np.asarray(gain), dims))
-
-
-def _log_p(gain: np.ndarray, dims: int) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        value = np.log10(gammaincc(0.5 * dims, 0.5 * np.maximum(gain, 0.0)))
-    return np.where(
-        np.isfinite(value), value, -(gain - (dims - 2) * np.log(np.maximum(gain, 1.0))) / (2 * np.log(10))
-    )
+    tail = float(gammaincc(0.5 * dims, 0.5 * max(gain, 0.0)))
+    if tail > 0:
+        return math.log10(tail)
+    return -(gain - (dims - 2) * math.log(max(gain, 1.0))) / (2 * math.log(10))
 
 
 @dataclass(frozen=True)

@@ -113,11 +113,11 @@ def screen(
             if metric is first and norms is not None:
                 left = np.linalg.norm(rows, axis=0)
                 norms += [Norms(*n) for n in zip(part, map(float, full), map(float, left), strict=True)]
-            for k, column in enumerate(part):
+            for column, own, norm in zip(part, np.ascontiguousarray(rows.T), map(float, full), strict=True):
                 candidate, group, _, count = column.item
                 key = (id(metric), id(candidate), group)
                 entries = pending.setdefault(key, [])
-                entries.append((column, rows[:, k].copy(), float(full[k])))
+                entries.append((column, own, norm))
                 if len(entries) == count:
                     del pending[key]
                     _score_rows(entries, metric, leaders)
@@ -213,6 +213,6 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
 
 def _score_rows(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
     """Score the columns of one group, and keep their best direction."""
-    rows = np.stack([e[1] for e in entries], axis=1)
+    rows = np.stack([e[1] for e in entries]).T
     full = np.array([e[2] for e in entries])
     score([e[0] for e in entries], rows, rows.T @ metric.residual, full, best)
