@@ -13,7 +13,7 @@ from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.law.smooth import _smoothed
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search.metric import FREE, ROWS, Absorbed, Metric, Plain
-from thermoctl.diagnosis.search.overlay import _filtered
+from thermoctl.diagnosis.search.overlay import filtered
 from thermoctl.plant.fitting import residuals
 
 
@@ -92,4 +92,4 @@ def test_steps_that_are_joined_in_pairs_give_the_same_lag_as_one_after_the_other
     for c, g in zip(decay, gain, strict=True):
         value = value * c + g
         expected.append(value)
-    assert np.allclose(_filtered(decay, gain, 2.0), expected, rtol=1e-12, atol=1e-12)
+    assert np.allclose(filtered(decay, gain, 2.0), expected, rtol=1e-12, atol=1e-12)

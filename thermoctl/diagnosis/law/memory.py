@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermoctl.diagnosis.search.overlay import filtered
+
 Shapes = Mapping[str, np.ndarray]
 Along = Callable[[np.ndarray, np.ndarray, Shapes, float], np.ndarray]
 
@@ -42,11 +44,9 @@ class SignalMemory:
 
 
 def _lag(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.ndarray:
-    out = np.empty((len(t), len(shapes["tau"])))
-    out[0] = z[0]
-    for k, a in enumerate(np.exp(-np.diff(t)[:, None] / shapes["tau"]), 1):
-        out[k] = a * out[k - 1] + (1 - a) * z[k - 1]
-    return out
+    decay = np.exp(-np.diff(t)[:, None] / shapes["tau"])
+    start = np.full((1, decay.shape[1]), z[0])
+    return np.concatenate([start, filtered(decay, (1 - decay) * z[:-1, None], start)])
 
 
 def _total(t: np.ndarray, z: np.ndarray, shapes: Shapes, duration: float) -> np.ndarray:

@@ -129,11 +129,11 @@ def _new_node(
     mid_a, mid_b = 0.5 * (before[1:] + a[:-1]), np.maximum(0.5 * (b[1:] + b[:-1]), 0.0)
     decay = np.exp(-mid_b * h)
     gain = np.where(mid_b * h > 1e-9, -np.expm1(-mid_b * h) / np.maximum(mid_b, 1e-300), h) * mid_a
-    return np.concatenate([[start], _filtered(decay, gain, start)])
+    return np.concatenate([[start], filtered(decay, gain, start)])
 
 
-def _filtered(decay: np.ndarray, gain: np.ndarray, start: float) -> np.ndarray:
-    """Return x_k = decay_k x_(k-1) + gain_k (N,), x_0 = `start`; decay is at most 1.
+def filtered(decay: np.ndarray, gain: np.ndarray, start: np.ndarray | float) -> np.ndarray:
+    """Return x_k = decay_k x_(k-1) + gain_k (N, ...), x_0 = `start`; decay is at most 1.
 
     Steps are joined in pairs, then in fours and so on (Hillis, Steele 1986): no loop over rows."""
     decay, out, reach = decay.copy(), gain.copy(), 1
