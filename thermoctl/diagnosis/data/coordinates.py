@@ -23,7 +23,7 @@ from thermoctl.plant.simulation.simulate import Excitation
 
 SINGLE = 6  # lowest rows that are bands of their own
 WIDTH = 1.19  # ratio of a band's ends: a quarter of an octave
-SHORT = 500  # up to so many samples no DCT takes long
+SHORT = 4_000  # up to so many samples a DCT is fast for any number of them
 FEWEST = 8  # an output with fewer measured samples in a recording is not used there
 
 
@@ -75,9 +75,10 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     index = measured(d.y[:, j])
     if len(index) < FEWEST:
         return None
+    if quick(len(index)) < len(index):
+        index = index[: quick(len(index))]
     block = max(1, len(index) // (2 * most)) if most else 1
-    n = quick(len(index) // block)
-    index = index[: n * block]
+    n = len(index) // block
     rows = min(n, most or n)
     edges, count, band = _bands(rows)
     middle = 0.5 * (edges[:-1] + edges[1:] - 1)
