@@ -117,7 +117,7 @@ def pairs(
 
     The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
     joint gain has to outweigh their prior odds."""
-    kept = [d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate)]
+    kept = once(d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate))
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
