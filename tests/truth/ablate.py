@@ -131,6 +131,12 @@ RULES: Mapping[str, Rule] = {
     "unasked": Rule(
         "where nothing is asked of other parts, the log evidence counts less", limits={"unasked": 1.0}
     ),
+    **{
+        f"unasked {d:g}": Rule(
+            f"there it is divided by `unasked`; by {d:g} in its place", limits={"unasked": d}
+        )
+        for d in (2.0, 3.0)
+    },
     "floor": Rule("an error far below the noise is luck", {"verdict.confirm.FLOOR": 1e-6}),
     "draws": Rule("a smooth error counts as few draws", {"verdict.confirm._draws": _all}),
     "size": Rule("a size left out may vanish: its prior", {"verdict.confirm.WIDTH": 1e3}),

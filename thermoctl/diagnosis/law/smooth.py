@@ -91,12 +91,11 @@ class Tracked:
         """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
         model, t = self.metric.model, self.metric.drives[r].t
         forces, q = list[tuple[int, int]](), []
-        finite = flows[r] if np.isfinite(flows[r]).all() else np.nan_to_num(flows[r])
         for k, node in enumerate(reversed(place.nodes)):
             storage = ex.series(model.plant.nodes[node].storage, self.metric.signals[r], t)
             forces += [(model.states.index(node), c) for c in range(flows[r].shape[1])]
-            q.append(finite / ((-1) ** k * storage[:, None]))
-        return Pushed(forces, np.concatenate(q, axis=1) if len(q) > 1 else q[0], {})
+            q.append((-1) ** k * np.nan_to_num(flows[r]) / storage[:, None])
+        return Pushed(forces, np.concatenate(q, axis=1), {})
 
     def flows(self, nodes: Sequence[str]) -> tuple[float, float]:
         """Return the log marginal likelihood of free flows into nodes, over that of none, and their size.
