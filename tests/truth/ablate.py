@@ -148,6 +148,11 @@ RULES: Mapping[str, Rule] = {
         "an unknown flow is one more hypothesis where nothing else is certain",
         {"diagnose.flow_missing": lambda *a: Missing()},
     ),
+    "energy": Rule(
+        "where the error is twice the noise, effects are proposed by their gain in energy, too",
+        {"search.screening.LOUD": float("inf")},
+        searches=True,
+    ),
     "pairs": Rule(
         "two effects that explain far more together than alone are refitted together",
         {"search.shortlist.pairs": _none},
