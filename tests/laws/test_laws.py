@@ -160,6 +160,21 @@ def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
     assert c.place.nodes == {"target": "shell"} and "shell" not in known.plant.nodes
 
 
+@pytest.mark.parametrize("place", [Place("one"), Place("two", "one"), Place("one", None, "storage")])
+def test_a_plant_with_a_law_of_any_form_at_any_place_can_be_read_again(found, place, tmp_path):
+    """A law of the past in a storage brought a flow 'law_storage of velocity': its diagnosis ended in an error."""
+    plant = loads(TWO_BLOCKS)
+    heat = Signal("heat", ex.name("heat"), "W")
+    terms = [f.term(0) for f in families([heat], [heat], 400.0, 1.0)]
+    assert {t.form.memory for t in terms} > {None}
+    for t in terms:
+        c = law_candidate(Rig(plant, [], []), replace(found[2].proposal, place=place, terms=(t,)))
+        made = c.extend({q.name: t.shapes.get(q.name[:-1], 0.01) for q in c.effect.parameters})
+        save(made, tmp_path / "plant.yaml")
+        again = load(tmp_path / "plant.yaml")
+        assert (again.nodes.keys(), again.flows.keys()) == (made.nodes.keys(), made.flows.keys())
+
+
 def test_parameters_that_scale_together_absorb_no_flow():
     made = make(next(law for law in LAWS if law.name == "thermostat"), "reactor", "small", "closed", 7)
     known = case(made.plant, made.tables[:2], {}, Budget(80))

@@ -21,7 +21,7 @@ from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job, Run
-from thermoctl.plant import load
+from thermoctl.plant import load, save
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -60,6 +60,8 @@ def _result(job: Job, path: Path) -> dict[str, Any]:
     diagnosis = engine.decided(found)
     if wrong := relabelled(diagnosis, limits()):
         raise InputError(str(wrong[0]))
+    save(diagnosis.final.plant, path.with_name("plant.yaml"))
+    load(path.with_name("plant.yaml"))
     return contract(diagnosis)
 
 
