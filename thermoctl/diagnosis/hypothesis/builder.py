@@ -42,13 +42,13 @@ class Candidate:
         return self.effect.name, self.place.where
 
     @property
-    def name(self) -> str:
-        """Return effect and place as one name of a plant file."""
+    def in_plant(self) -> str:
+        """Return effect and place as one name of the plant."""
         return f"{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
 
     def own(self, parameter: str) -> str:
         """Return the name in the plant of one of the effect's parameters, or of a node that it adds."""
-        return f"{parameter}_{self.name}"
+        return f"{parameter}_{self.in_plant}"
 
     def own_in(self, plant: Plant) -> dict[str, str]:
         """Return the names of those parameters of the effect that the plant has, by parameter."""
@@ -213,7 +213,7 @@ class _Builder:
     # A method for each kind of change, `_` and its key in an effect file (docs/reference/effect-files.md).
 
     def _flow(self, what: Mapping[str, Any]) -> None:
-        label = self.c.name
+        label = self.c.in_plant
         while label in self.flows or label in self.nodes or label in self.outputs:
             label += "_2"
         ends = {**self.made, **self.place.nodes}

@@ -164,4 +164,4 @@ def equation(rate: ex.Expr, f: Fitted) -> str:
     c, text = law.candidate, readable(rate)
     for q in c.effect.parameters:
         text = re.sub(rf"\b{re.escape(c.own(q.name))}\b", q.name, text)
-    return re.sub(rf"\b(m\d)_{re.escape(c.own('')[1:])}\b", r"\1", text)
+    return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)
