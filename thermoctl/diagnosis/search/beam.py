@@ -344,7 +344,9 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
     quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
-    queue, planned, ratio = shortlist(looked, where, limits), case.budget.later, 1.0
+    # beside effects that leave only noise, two more would imitate a small misfit
+    misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
+    queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""

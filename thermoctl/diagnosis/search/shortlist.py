@@ -73,12 +73,14 @@ def predicted(d: Direction, promise: float, where: Mapping[str, set[str]], limit
     return float(promise + odds((Placed(d.candidate, {}),), where, limits))
 
 
-def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Thresholds) -> list[Extension]:
+def shortlist(
+    looked: Screened, where: Mapping[str, set[str]], limits: Thresholds, paired: bool
+) -> list[Extension]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
     First are those with the largest predicted gain, the best first. Then come those with the largest gain in
     energy, then pairs. The gain of a proposal by energy is infinite. At most PLACES_EACH places of an effect
-    are listed alone."""
+    are listed alone. `paired`: with pairs that are not proposed by energy?"""
     worthwhile = []
     for d, promise in zip(looked.directions, looked.promises, strict=True):
         gain = predicted(d, promise, where, limits)
@@ -92,7 +94,8 @@ def shortlist(looked: Screened, where: Mapping[str, set[str]], limits: Threshold
     ]
     listed = {d.candidate.key for (d,), _ in out}
     out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in listed]
-    out += pairs(looked.every, looked.metric, where, limits)
+    if paired:
+        out += pairs(looked.every, looked.metric, where, limits)
     if looked.energy:
         out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
     return out
