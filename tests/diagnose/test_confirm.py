@@ -49,6 +49,17 @@ def test_the_weakest_name_leaves_first_and_the_rest_is_asked_again():
     assert after.effects[A] > 0.99 and after.effects[B] == asked[B] < 0.9
 
 
+def test_a_weaker_effect_without_a_name_leaves_before_a_name():
+    beside = np.full(8, 1.0) + 0.01 * np.arange(8)
+    drift = beside * np.array([1.5, 1.4, 1.3, 0.9, 0.8, 1.01, 1.02, 1.03])  # without A: six parts are worse
+    without_b = beside * np.array([1.2, 0.7, 1.1, 0.8, 1.3, 0.9, 1.05, 0.95])
+    test = with_errors({NONE: np.full(8, 50.0), ONE: without_b, frozenset({B}): drift, BOTH: beside})
+    posterior = Probabilities({BOTH: 0.6}, {A: 1.0, B: 0.6}, 1.0)
+    kept, after, asked = confirmed(posterior, BOTH, test, 0.9)
+    assert kept == ONE and after.effects[A] == asked[A] > 0.99
+    assert after.effects[B] == 0.6 and B not in asked
+
+
 def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():
     test = with_errors({NONE: np.full(8, 50.0), ONE: np.full(8, 1.0)})
     test._known[ONE] = None

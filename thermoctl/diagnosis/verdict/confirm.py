@@ -238,14 +238,18 @@ def confirmed(
 ) -> tuple[Keys, Probabilities, dict[Key, float]]:
     """Return the confirmed effects of a hypothesis, the posterior, and each tested effect's probability.
 
-    The effect with the lowest probability below `name` is removed. Then the others are tested again."""
+    Where an effect that would be named is not confirmed, the weakest of all is removed. Then the others are
+    tested again: beside a wrong effect a right one may not help."""
     asked: dict[Key, float] = {}
     keys = best
     while True:
         own = {k: test.probability(keys, k) for k in keys if posterior.effects[k] >= name}
         asked |= own
-        weakest = min(own, key=lambda k: own[k], default=None)
-        if weakest is None or own[weakest] >= name or keys - {weakest} not in test.tried:
+        if min(own.values(), default=1.0) >= name:
+            break
+        own |= {k: test.probability(keys, k) for k in keys - own.keys()}
+        weakest = min(own, key=lambda k: own[k])
+        if keys - {weakest} not in test.tried:
             break
         keys = keys - {weakest}
     effects = {k: min(p, asked.get(k, 1.0)) for k, p in posterior.effects.items()}
