@@ -50,6 +50,7 @@ def test_a_refit_finds_the_sample_of_a_jump(known, off):
     f = fitted(known, plant, (effect,))
     assert f.plant.parameters[effect.own["T0"]].value == pytest.approx(TRUE - 0.5, abs=0.6)
     assert f.plant.parameters[effect.own["A"]].value == pytest.approx(1.5, abs=0.1)
+    assert f.sd[effect.own["T0"]] == pytest.approx(12**-0.5, rel=0.1)  # anywhere between two samples
 
 
 def test_a_jump_that_is_in_place_stays(known):
@@ -61,29 +62,37 @@ def test_a_jump_that_is_in_place_stays(known):
 CUT = 0.11  # N
 
 
-@pytest.fixture
-def cut(tmp_path):
+def stage(path, force):
     """A stage whose drive does nothing below 0.11 N, and all of it above."""
-    path, t = tmp_path / "plant.yaml", 0.002 * np.arange(4000.0)
     path.write_text(SPRING_STAGE)
-    force = 0.5 * np.sin(2 * np.pi * (0.4 * t + 0.3 * t**2)) * np.random.default_rng(2).uniform(0, 1, 4000)
+    t = 0.002 * np.arange(float(len(force)))
     plant = compile_plant(load(path))
     reached = plant.measure(Table("run", "run", t, {"force": force * (np.abs(force) >= CUT)}), seed=1)
-    return case(
-        load(path),
-        [dataclasses.replace(reached, columns={**reached.columns, "force": force})],
-        {},
-        Budget(20),
-    )
+    table = dataclasses.replace(reached, columns={**reached.columns, "force": force})
+    return case(load(path), [table], {}, Budget(20))
 
 
-@pytest.mark.parametrize("start", [0.02, 0.11, 0.4])
-def test_a_refit_finds_the_level_at_which_a_drive_is_cut_and_how_sure_it_is(cut, start):
+def with_dead_zone(cut, start):
+    """The stage refitted with a dead zone of the drive: its level and standard deviation."""
     rig = Rig(cut.plant, cut.drives(cut.null.model), [t.columns for t in cut.tables])
     entry = catalogue((CATALOGUE,))["actuator_dead_zone"]
     c = next(c for c in candidates(rig, {entry.name: entry}) if c.variant == 1)
     effect = Placed(c, {"U": c.own("U")})
     f = fitted(cut, c.extend({"U": start}, {"U": (1e-3, 0.6)}), (effect,))
-    level, sd = f.plant.parameters[effect.own["U"]].value, f.sd[effect.own["U"]]
+    return f.plant.parameters[effect.own["U"]].value, f.sd[effect.own["U"]]
+
+
+@pytest.mark.parametrize("start", [0.02, 0.11, 0.4])
+def test_a_refit_finds_the_level_at_which_a_drive_is_cut_and_how_sure_it_is(tmp_path, start):
+    t, size = 0.002 * np.arange(4000.0), np.random.default_rng(2).uniform(0, 1, 4000)
+    force = 0.5 * np.sin(2 * np.pi * (0.4 * t + 0.3 * t**2)) * size
+    level, sd = with_dead_zone(stage(tmp_path / "plant.yaml", force), start)
     assert abs(level - CUT) < 3 * sd + 0.01 * CUT
     assert 0 < sd < 0.1 * CUT  # half the range, were its width the prior's
+
+
+@pytest.mark.parametrize("start", [0.06, 0.11, 0.19])
+def test_a_level_between_two_values_of_a_drive_may_be_anywhere_between_them(tmp_path, start):
+    force = np.repeat(np.random.default_rng(2).choice([-0.5, -0.2, -0.05, 0.05, 0.2, 0.5], 40), 100)
+    level, sd = with_dead_zone(stage(tmp_path / "plant.yaml", force), start)
+    assert 0.09 < level < 0.15 and sd == pytest.approx(0.075 / 2**0.5, rel=0.1)

@@ -9,7 +9,7 @@ from operator import mul
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.onsets import UNSEEN
+from thermoctl.diagnosis.evidence.onsets import TIMES, UNSEEN
 from thermoctl.diagnosis.evidence.posterior import Posterior, Seen
 from thermoctl.plant.fitting.climb import Spot
 from thermoctl.plant.fitting.residuals import Problem
@@ -19,7 +19,7 @@ EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is 
 MOST = 0.9  # largest share of the curvature that the unknown spectrum may remove
 # Steps of an unknown in 0..1 without slopes: the first one, the factor to the next, and the fall, nats, that
 # ends them.
-FIRST, LONGER, FALL = 1e-6, 3.0, 1.0
+FIRST, LONGER, FALL = 1e-6, 1.1, 1.0
 
 
 def kept(h: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -34,7 +34,8 @@ def deviations(
 ) -> dict[str, float]:
     """Return the standard deviations of the effects' parameters, in their units.
 
-    A parameter of the plant at its bound is held there: it cannot absorb part of an effect."""
+    A parameter of the plant at its bound is held there: it cannot absorb part of an effect. A reading that
+    jumps tells between which samples, not when."""
     problem, plant_parameters, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
     moves = np.array([q not in bounds or q not in plant_parameters for q, _ in problem.unknowns])
     sd = np.zeros(len(moves))
@@ -44,6 +45,11 @@ def deviations(
         if q not in plant_parameters:
             slope = problem.scales[q].slope(float(values[0, posterior.model.parameters.index(q)]))
             out[q] = max(out.get(q, 0.0), float(sd[k] * slope))
+    sample = min(float(np.median(np.diff(d.t))) for d in problem.excitations)
+    jumps = (e for e in posterior.effects if e.candidate.place.output)
+    for name in (e.own.get(p.name) for e in jumps for p in e.candidate.effect.parameters if p.shape in TIMES):
+        if name in out:
+            out[name] = float(np.hypot(out[name], sample / 12**0.5))
     return out
 
 
@@ -67,38 +73,39 @@ def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:
     return left * np.outer(size, size)
 
 
-def without_slopes(posterior: Posterior, spot: Spot[Seen], matrix: np.ndarray) -> np.ndarray:
-    """Return the curvature (k,) of the log posterior by parameters of effects that have no slopes, else 0.
+def without_slopes(
+    posterior: Posterior, spot: Spot[Seen], matrix: np.ndarray
+) -> tuple[np.ndarray, Spot[Seen]]:
+    """Return the curvature (k,) by parameters of effects that have no slopes, else 0, and a spot.
 
-    A level at which a signal is cut is such a parameter. On each side the first step counts by which the
-    log posterior falls by FALL and more."""
-    out = np.zeros(len(spot.z))
+    A level at which a signal is cut is such a parameter. Between two samples' values the log posterior does
+    not change, and beyond them it falls at once. So the spot lies in the middle of these ends. The curvature
+    is that of a normal density that falls by FALL at half their distance."""
+    out, z = np.zeros(len(spot.z)), spot.z.copy()
     of_effects = {n for e in posterior.effects for n in e.own.values()}
     for k, (q, _) in enumerate(posterior.problem.unknowns):
         if q in of_effects and matrix[k, k] < UNSEEN:
-            out[k] = np.mean([_fall(posterior, spot, k, side) for side in (-1, 1)])
-    return out
+            below, above = (_reach(posterior, spot, k, side) for side in (-1, 1))
+            out[k] = 2 * FALL / (0.5 * (below + above)) ** 2
+            z[k] += 0.5 * (above - below)
+    middle = posterior.look(z, False) if out.any() else spot
+    return out, middle if middle.height > spot.height - FALL else spot
 
 
-def _fall(posterior: Posterior, spot: Spot[Seen], k: int, side: int) -> float:
-    """Return twice the fall over the square of the first step of unknown k that falls by FALL.
+def _reach(posterior: Posterior, spot: Spot[Seen], k: int, side: int) -> float:
+    """Return the first step of unknown k by which the log posterior falls by FALL, or the room for steps.
 
     The log posterior falls the more, the longer the step: so the step is found by bisection."""
     room = 1 - spot.z[k] if side > 0 else spot.z[k]
     steps = list(takewhile(lambda step: step < room, accumulate(repeat(LONGER), mul, initial=FIRST)))
-    falls = dict[float, float]()
 
     def ends(step: float) -> bool:
         """Return whether a step falls by FALL, or cannot be simulated."""
         z = spot.z.copy()
         z[k] += side * step
         try:
-            falls[step] = spot.height - posterior.look(z, False).height
+            return spot.height - posterior.look(z, False).height >= FALL
         except SimulationError:
-            falls[step] = np.inf
-        return falls[step] >= FALL
+            return True
 
-    first = bisect_left(steps, True, key=ends)
-    if first == len(steps) or np.isinf(falls[steps[first]]):
-        return 0.0
-    return float(2 * falls[steps[first]] / steps[first] ** 2)
+    return [*steps, max(room, FIRST)][bisect_left(steps, True, key=ends)]

@@ -216,14 +216,15 @@ def _refitted(
 
 def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
     """Return the fitted hypothesis at the maximum `top`, with its log evidence by Laplace's method."""
-    problem, z, matrix = posterior.problem, top.spot.z, top.matrix
-    average, powers, errors = top.spot.found.average, top.spot.found.powers, top.spot.found.errors
+    problem, matrix = posterior.problem, top.matrix
+    flat, spot = without_slopes(posterior, top.spot, matrix)
+    z, average, powers, errors = spot.z, spot.found.average, spot.found.powers, spot.found.errors
     values, dx0 = problem.unpack(z)
     own, parameters = np.ones(len(z), bool), np.arange(len(z)) < problem.n_parameters
     own[np.concatenate([gaussian(posterior), posterior.believed])] = False
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
-    confined = relieved(confined, posterior.relief(z, top.spot.found.rows, average))
-    confined += np.diag(without_slopes(posterior, top.spot, matrix))
+    confined = relieved(confined, posterior.relief(z, spot.found.rows, average))
+    confined += np.diag(flat)
     bounds = at_bound(problem, z)
     sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
