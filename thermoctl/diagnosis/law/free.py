@@ -79,12 +79,11 @@ def _gains(
 
     Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
     functions with the largest gain in energy, and only these are returned."""
-    scored = []
-    for k, (place, flows) in enumerate(functions):
-        x = linear.columns(place, flows)
-        scored.append((energy(x, linear.target), k, x))
-    scored.sort(key=lambda f: -f[0])
-    out = [(predicted(linear, x)[0] - cost_of(linear, x.shape[1]), k) for _, k, x in scored[:RANKED]]
+    energies = [energy(linear.columns(*f), linear.target) for f in functions]
+    out = []
+    for k in np.argsort(-np.array(energies), kind="stable")[:RANKED].tolist():
+        x = linear.columns(*functions[k])  # simulated again: thousands would fill the memory
+        out.append((predicted(linear, x)[0] - cost_of(linear, x.shape[1]), k))
     return sorted(out, key=lambda f: -f[0])
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, Rig, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.language import Plant
 from thermoctl.units import conversion, dimension
 
+BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
 Values = Mapping[str, np.ndarray | float]
@@ -82,7 +84,9 @@ def places(rig: Rig) -> list[Place]:
 
 
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
-    """Return the signals that a law at a place may depend on, each with its typical size over the runs."""
+    """Return the signals that a law at a place may depend on, each with its typical size over the runs.
+
+    A node that the plant links to the place through two or more others is none: it acts through these."""
     p, out = rig.physics, []
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
     for n in near:
@@ -91,7 +95,8 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
     if place.source and p.nodes[place.source].unit == p.nodes[place.target].unit:
         out.append(_between(rig, place, place.source, place.target))
-    for n in (n for n in p.nodes if n not in near):
+    far = _far(p, place)
+    for n in (n for n in p.nodes if n not in near and n not in far):
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
         linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
         if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
@@ -102,6 +107,15 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
             out.append(_absolute(rig, place, i, p.inputs[i].unit))
     sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
     return [s for s in sized if s is not None]
+
+
+def _far(p: Plant, place: Place) -> set[str]:
+    """Return the nodes that flows link to a place through two or more other nodes."""
+    links = [{f.source or "", f.target or "", *ex.names(f.rate)} & p.nodes.keys() for f in p.flows.values()]
+    rounds = [set(place.nodes)]
+    for _ in range(max(len(p.nodes), BESIDE)):
+        rounds.append(rounds[-1].union(*(link for link in links if link & rounds[-1])))
+    return rounds[-1] - rounds[BESIDE]
 
 
 def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
