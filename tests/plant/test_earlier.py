@@ -1,5 +1,7 @@
 """Signals some seconds earlier, beside SciPy's Akima interpolation."""
 
+import warnings
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,3 +44,12 @@ def test_a_delayed_jump_does_not_overshoot(seconds):
 def test_a_signal_of_two_samples_is_a_line():
     values, slope, _ = earlier(np.array([0.0, 2.0]), np.array([1.0, 5.0]), 0.5)
     assert values.tolist() == [1.0, 4.0] and slope.tolist() == [0.0, 2.0]
+
+
+def test_the_slopes_of_a_run_away_from_the_data_bring_no_warning():
+    t, slopes = np.arange(6.0), np.full((6, 1), 1e308)
+    slopes[::2] *= -1
+    slopes[3:5] = np.inf
+    with warnings.catch_warnings(action="error"):
+        values, _, changes = earlier(t, t, 0.5, slopes)
+    assert np.isfinite(values).all() and not np.isfinite(changes).all()

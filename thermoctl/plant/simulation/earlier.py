@@ -7,6 +7,7 @@ import numpy as np
 LEAST = 1e-9  # smaller bends, as a share of the largest, are rounding errors
 
 
+@np.errstate(over="ignore", invalid="ignore")  # the sensitivities of a run away from the data
 def earlier(
     t: np.ndarray, g: np.ndarray, seconds: float, dg: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
