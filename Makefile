@@ -131,12 +131,12 @@ bench-parts: develop               # where the time of a diagnosis goes, by fami
 	$(BIN)/python -m tests.bench.parts $(if $(BEFORE),--before $(BEFORE)) $(CASES)
 
 .PHONY: bench-bodies bench-recordings
-bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; half an hour
-	$(BIN)/python -m tests.bench.scale bodies
+bench-bodies: develop              # cost of a diagnosis by bodies: chains and networks of 12 to 120; BEFORE= as above; half an hour
+	$(BIN)/python -m tests.bench.scale bodies $(if $(BEFORE),--before $(BEFORE))
 
-bench-recordings: develop          # a weak effect by recordings; cost by recordings of 30 000 rows, by cores and workers; half an hour
-	$(BIN)/python -m tests.bench.scale weak
-	$(BIN)/python -m tests.bench.scale recordings
+bench-recordings: develop          # a weak effect by recordings; cost by recordings of 30 000 rows, by cores and workers; BEFORE= as above; half an hour
+	$(BIN)/python -m tests.bench.scale weak $(if $(BEFORE),--before $(BEFORE))
+	$(BIN)/python -m tests.bench.scale recordings $(if $(BEFORE),--before $(BEFORE))
 
 .PHONY: prove-refit refit-recordings
 prove-refit: develop               # share of 95 % intervals that contain the true parameter: 100 truths for each rig and noise

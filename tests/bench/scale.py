@@ -1,13 +1,13 @@
 """Cost of a diagnosis against the size of the data: rows of a recording, bodies of a plant.
 
-python -m tests.bench.scale rows [--rows 260000] [--before FOLDER]
+python -m tests.bench.scale rows [--rows 260000]
 python -m tests.bench.scale bodies [--bodies 12 30 60 120] [--shape chain network]
 python -m tests.bench.scale recordings [--recordings 1 6 12] [--workers 1 2]
 python -m tests.bench.scale weak [--weak 1 4 10 24]
 
 `rows`: a rig of two blocks whose free convection is concealed, logged every second, and the same record with
 one row in a hundred. Every diagnosis is a process of its own: CPU time (with the compiler's), memory, result.
---before FOLDER: a checkout of an older version; it works on the same records, with a limit of 30 minutes.
+--before FOLDER, with each of them: a checkout of an older version; it works on the same records, right after, with a limit of 30 minutes.
 `bodies`: blocks of which every third one is measured and every sixth one heated. In a chain a middle one, not heated,
 has a heat source that the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
 `recordings`: the actuator of twelve bodies, 30 000 rows a recording, with a missing link of two standard deviations in
@@ -39,8 +39,12 @@ from thermoctl.recording.table import Table
 
 BODY = """
 import json, os, resource, sys, time
-from thermoctl.diagnosis.run import diagnose_files
-from thermoctl.plant.fitting import residuals
+try:
+    from thermoctl.diagnosis.run import diagnose_files
+    from thermoctl.plant.fitting import residuals
+except ModuleNotFoundError:  # the folders of a372a6a and older
+    from thermoctl.diagnose.run import diagnose_files
+    from thermoctl.plant import cores as residuals
 calls, side_by_side = [], residuals.each
 def timed(f, items, numbers):  # on one core these run one after the other
     calls.append([])
@@ -163,7 +167,7 @@ def write(path: Path, table: Table) -> None:
 
 
 def diagnosed(
-    folder: Path, names: Sequence[str] = ("run_1.csv",), checkout: Path | None = None, workers: int = 0
+    folder: Path, names: Sequence[str], checkout: Path | None = None, workers: int = 0
 ) -> dict[str, object]:
     """Diagnose recordings in a process of its own, on `workers` cores (0: all); return its figures."""
     with tempfile.TemporaryDirectory() as work:
@@ -205,6 +209,19 @@ def line(label: str, found: dict[str, object]) -> None:
             print(f"{'':28} {note}")
 
 
+def compared(
+    label: str, folder: Path, names: Sequence[str], before: Path | None, workers: int = 0
+) -> dict[str, object]:
+    """Print and return the result of a diagnosis, and print that of an older version beside it."""
+    found = diagnosed(folder, names, workers=workers)
+    line(label, found)
+    if before:
+        old = diagnosed(folder, names, before, workers)
+        line(f"{label}, before", old)
+        print(f"{'':28} before / now: {old['cpu_s'] / found['cpu_s']:.2f}", flush=True)  # type: ignore[operator]
+    return found
+
+
 def rows(number: int, before: Path | None) -> None:
     """Print cost and result of a long record and of its thinned equivalent."""
     with tempfile.TemporaryDirectory() as work:
@@ -220,14 +237,9 @@ def rows(number: int, before: Path | None) -> None:
         )
         names = (folder / "run_1.csv").read_text().splitlines()
         (folder / "few.csv").write_text("\n".join([names[0], *names[1::THINNED]]) + "\n")
-        few, many = diagnosed(folder, ["few.csv"]), diagnosed(folder)
-        line(f"{number // THINNED} rows", few)
-        line(f"{number} rows", many)
+        few = compared(f"{number // THINNED} rows", folder, ["few.csv"], before)
+        many = compared(f"{number} rows", folder, ["run_1.csv"], before)
         print(f"{number} rows / {number // THINNED} rows: {many['cpu_s'] / few['cpu_s']:.2f} times the time")  # type: ignore[operator]
-        if before:
-            old = diagnosed(folder, checkout=before)
-            line(f"{number} rows, before", old)
-            print(f"before / now: {old['cpu_s'] / many['cpu_s']:.1f}")  # type: ignore[operator]
 
 
 def concealed(shape: str, n: int) -> tuple[str, str, str]:
@@ -242,7 +254,7 @@ def concealed(shape: str, n: int) -> tuple[str, str, str]:
     return block_plant(n, links), flow, f"missing_link at block_{first}-block_{second}"
 
 
-def bodies(numbers: list[int], shapes: list[str]) -> None:
+def bodies(numbers: list[int], shapes: list[str], before: Path | None) -> None:
     """Print time and memory of a diagnosis against the number of bodies, and the exponent between neighbours."""
     for shape in shapes:
         last: tuple[int, float] | None = None
@@ -250,8 +262,7 @@ def bodies(numbers: list[int], shapes: list[str]) -> None:
             plant, flow, truth = concealed(shape, n)
             with tempfile.TemporaryDirectory() as work:
                 recorded(Path(work), plant, flow, 1200, 10.0, 10.0)
-                found = diagnosed(Path(work))
-            line(f"{shape} of {n} bodies", found)
+                found = compared(f"{shape} of {n} bodies", Path(work), ["run_1.csv"], before)
             cpu = float(found["cpu_s"])  # type: ignore[arg-type]
             exponent = (
                 f", exponent from {last[0]}: {np.log(cpu / last[1]) / np.log(n / last[0]):.2f}"
@@ -263,7 +274,7 @@ def bodies(numbers: list[int], shapes: list[str]) -> None:
             last = n, cpu
 
 
-def recordings(numbers: list[int], workers: list[int]) -> None:
+def recordings(numbers: list[int], workers: list[int], before: Path | None) -> None:
     """Print time, memory and result against the number of recordings of a 12-body actuator, and of workers."""
     source = (Path(__file__).parents[2] / "config/plants/actuator_thermal.yaml").read_text()
     source = source.replace("resolution: 0.25", f"resolution: {CONVERTER}")
@@ -291,8 +302,8 @@ def recordings(numbers: list[int], workers: list[int]) -> None:
                 print(f"a link of {size:.3g} W/K: {SIGMAS} standard deviations in one recording", flush=True)
         for n in numbers:
             for w in workers if n == max(numbers) else workers[-1:]:
-                found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)], workers=w)
-                line(f"{n} recordings, {w} workers", found)
+                files = [f"run_{k}.csv" for k in range(1, n + 1)]
+                found = compared(f"{n} recordings, {w} workers", folder, files, before, w)
                 named = "named" if name in found.get("found", ()) else "not named"  # type: ignore[operator]
                 print(
                     f"{'':28} {found.get('wall_s', float('nan')):.1f} s; {SIGMAS * np.sqrt(n):.1f} sd: {named}",
@@ -322,7 +333,7 @@ def simulate_workers(cpu_s: float, calls: Sequence[Sequence[float]]) -> None:
     print(f"{'':28} 1, 2, 4, 16 workers: " + ", ".join(f"{t:.0f}" for t in times) + " s")
 
 
-def weak(numbers: list[int]) -> None:
+def weak(numbers: list[int], before: Path | None) -> None:
     """Print what is found of a missing link that one recording shows with SIGMAS standard deviations only."""
     name = "missing_link at block_1-block_4"
     with tempfile.TemporaryDirectory() as work:
@@ -338,8 +349,8 @@ def weak(numbers: list[int]) -> None:
             else:
                 (folder / str(k) / "run_1.csv").rename(folder / f"run_{k}.csv")
         for n in numbers:
-            found = diagnosed(folder, [f"run_{k}.csv" for k in range(1, n + 1)])
-            line(f"{n} recordings, {SIGMAS * np.sqrt(n):.1f} sd", found)
+            files = [f"run_{k}.csv" for k in range(1, n + 1)]
+            found = compared(f"{n} recordings, {SIGMAS * np.sqrt(n):.1f} sd", folder, files, before)
             print(f"{'':28} {name}: {'named' if name in found.get('found', ()) else 'not named'}", flush=True)  # type: ignore[operator]
 
 
@@ -372,11 +383,11 @@ def main() -> int:
     if a.what == "rows":
         rows(a.rows, a.before)
     elif a.what == "bodies":
-        bodies(a.bodies, a.shape)
+        bodies(a.bodies, a.shape, a.before)
     elif a.what == "weak":
-        weak(a.weak)
+        weak(a.weak, a.before)
     else:
-        recordings(a.recordings, a.workers)
+        recordings(a.recordings, a.workers, a.before)
     return 0
 
 
