@@ -72,3 +72,34 @@ def test_beside_one_effect_that_leaves_only_noise_a_distant_rival_is_not_extende
     s = Known({"": {"a": 145.0, "b": score}, "a": {"ac": 140.0}})
     grow(s)
     assert ("b" in s.order) == (score > 145.0 - beam.NEAR)
+
+
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_a_rival_at_the_place_of_the_leading_effect_is_refitted_though_it_promises_less(monkeypatch, where):
+    """A delay of a reading promised more than a lag, so the lag, 27 nats likelier, was never refitted."""
+    reached = {("delay", "here"): 100.0, ("drift", "there"): 10.0, ("lag", where): 130.0}
+    promised = dict(zip(reached, (100.0, 90.0, 60.0), strict=True))
+    effect = SimpleNamespace(contains=None)
+    queue = [
+        ((SimpleNamespace(candidate=SimpleNamespace(key=k, effect=effect)),), gain)
+        for k, gain in promised.items()
+    ]
+
+    def refit(case, parent, looked, batch, leader):
+        """Return a refit of each extension, with its known score."""
+        out = []
+        for (d,), _ in batch:
+            f = weighed("", reached[d.candidate.key]).fitted
+            f.hypothesis.keys = frozenset([d.candidate.key])
+            f.hypothesis.effects, f.absent, f.doubtful, f.log_likelihood = (d,), False, False, f.log_evidence
+            out.append([f])
+        return out
+
+    monkeypatch.setattr(beam, "shortlist", lambda *a, **k: queue)
+    monkeypatch.setattr(beam, "refitted", refit)
+    monkeypatch.setattr(beam, "odds", lambda *a: 0.0)
+    s = Known({})
+    vars(s.case.budget).update(fits_done=0, planned=0, untried=0)
+    s.best.fitted.log_likelihood = 0.0
+    found = beam.extensions(s, s.best, None)
+    assert (("lag", where) in {k for w in found for k in w.fitted.hypothesis.keys}) == (where == "here")

@@ -358,7 +358,10 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         own = ahead.fitted.hypothesis.keys
         if own not in quiet:
             quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        if parent.score + _reach(gain, ratio, quiet[own]) < ahead.score:
+        # a promise tells little between two effects at one place, as a lag and a delay of a reading
+        new = own - parent.fitted.hypothesis.keys
+        rival = any(d.candidate.key[1] == where for d in added for _, where in new)
+        if parent.score + _reach(gain, ratio, quiet[own] and not rival) < ahead.score:
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
