@@ -6,15 +6,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.bench.scale import block_plant, recorded
 from tests.checks.rigs import inputs, truth
 from tests.plants import TWO_BLOCKS
 from thermoctl.checks import checks
-from thermoctl.diagnosis.data.case import Budget, case, with_columns
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.data.columns import Columns
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import absurd, relabelled
-from thermoctl.plant import loads
+from thermoctl.plant import load, loads
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
@@ -59,12 +63,37 @@ def test_columns_are_swapped_in_the_rows_that_were_diagnosed():
         """Return a recording with the two temperatures swapped."""
         return dataclasses.replace(x, columns=x.columns | {ONE: x.columns[TWO], TWO: x.columns[ONE]})
 
-    for recorded, fits in ((table, False), (swap(table), True)):
-        known = case(plant, [recorded], catalogue((CATALOGUE,)), Budget(1))
-        again = with_columns(known, swap, Budget(1))
+    for read, fits in ((table, False), (swap(table), True)):
+        known = case(plant, [read], catalogue((CATALOGUE,)), Budget(1))
+        again = Columns(known).changed(swap, Budget(1))
         assert known.block > 1 and (again is not None) is fits
         if again:
             assert sorted(g.count.sum() for g in again.grids) == sorted(g.count.sum() for g in known.grids)
+
+
+def test_other_readings_are_evaluated_from_one_run(tmp_path):
+    recorded(tmp_path, block_plant(7), "{into: block_2, rate: 0.5, unit: W}", 300, 10.0, 10.0)
+    plant = load(tmp_path / "plant.yaml")
+    (table,) = read_recordings(plant, [tmp_path / "run_1.csv"])
+    gaps = {
+        **table.columns,
+        "temperature_4": np.where(table.t == 500, np.nan, table.columns["temperature_4"]),
+    }
+    known = case(plant, [dataclasses.replace(table, columns=gaps)], {}, Budget(1))
+    one, four = (known.tables[0].columns[f"temperature_{k}"] for k in (1, 4))
+    there = np.isfinite(one) & np.isfinite(four)
+    swapped = {"temperature_1": np.where(there, four, one), "temperature_4": np.where(there, one, four)}
+    drives = [
+        known.null.model.excitation(dataclasses.replace(t, columns={**t.columns, **swapped}))
+        for t in known.tables
+    ]
+    found = Columns(known)._read(drives)
+    exact = Problem(known.null.model, drives, known.noise).evaluate(known.null.z, True)
+    assert found.cost == pytest.approx(exact.cost, rel=1e-6)
+    assert found.gradient == pytest.approx(exact.gradient, rel=1e-6, abs=1e-6 * np.abs(exact.gradient).max())
+    assert found.matrix == pytest.approx(exact.matrix, rel=1e-5, abs=1e-6 * exact.matrix.max())
+    driven = dataclasses.replace(drives[0], u=drives[0].u + 1.0)
+    assert Columns(known)._read([driven]) is None
 
 
 @pytest.mark.parametrize(("gain", "refused"), [(1.79, True), (0.25, True), (1.1, False), (0.7, False)])

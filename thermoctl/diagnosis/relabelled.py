@@ -21,7 +21,8 @@ import numpy as np
 
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
-from thermoctl.diagnosis.data.case import Budget, Case, with_columns
+from thermoctl.diagnosis.data.case import Budget, Case
+from thermoctl.diagnosis.data.columns import Columns
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
@@ -56,10 +57,11 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     pairs = [h for h in swaps(known.plant, known.tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Case] | None = None
+    columns = Columns(known)
     for h in pairs:
         budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
-            again = with_columns(known, h.change, budget)
+            again = columns.changed(h.change, budget)
             if again is None:
                 continue
             score = fitted(again, again.plant, (), again.null).log_evidence

@@ -23,7 +23,6 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back, reuse_memory
 from thermoctl.plant.fitting.refit import Fit, fit
-from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
@@ -34,9 +33,6 @@ LEAST = 40  # least number of measured values of at least one output
 STATED = 12  # least number if the plant file states the output's noise, so that it is not estimated
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
-# Predicted cost with other columns, over that as recorded. In six concealed cases it was 0.00 to 0.93 for 16
-# pairs of columns that were swapped. For those that were not it was 14 and more.
-FAR_WORSE = 5.0
 FAST = 0.01  # share of an output's changes that may be jumps
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
@@ -218,7 +214,7 @@ def case(
         noise,
         null,
         coordinates,
-        _grids(coordinates, drives, null, fewer.block),
+        grids_of(coordinates, drives, null, fewer.block),
         budget,
         notes=[*freed, *averaged, *left_out, *guesses],
         block=fewer.block,
@@ -226,29 +222,6 @@ def case(
         rtol=rtol,
         memory=memory,
         outliers=dropped,
-    )
-
-
-def with_columns(known: Case, change: Callable[[Table], Table], budget: Budget) -> Case | None:
-    """Return the case with changed columns in the same rows, so that log evidences can be compared.
-
-    Nothing is averaged or left out again. None if the refit stays worse than that of `known`. A linear step
-    from there predicts most such refits, which are not made. Raises SimulationError."""
-    tables, model = tuple(change(t) for t in known.tables), known.null.model
-    drives = [dataclasses.replace(model.excitation(t), rtol=known.rtol) for t in tables]
-    first = Problem(model, drives, known.noise).evaluate(known.null.z, True)
-    step = np.linalg.lstsq(first.matrix, first.gradient, rcond=None)[0]
-    if first.cost - first.gradient @ step > FAR_WORSE * known.null.cost:
-        return None
-    null = fit(
-        model, drives, known.noise, iterations=40, tolerance=ROUGH, seconds=np.inf, goal=known.null.cost
-    )
-    if null.cost > known.null.cost:
-        return None
-    coordinates = Coordinates(drives)
-    grids = _grids(coordinates, drives, null, known.block)
-    return dataclasses.replace(
-        known, tables=tables, null=null, coordinates=coordinates, grids=grids, budget=budget
     )
 
 
@@ -268,7 +241,9 @@ def _enough(model: Model, drives: Sequence[Excitation], paths: str) -> None:
     )
 
 
-def _grids(coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, block: int) -> tuple[Grid, ...]:
+def grids_of(
+    coordinates: Coordinates, drives: Sequence[Excitation], null: Fit, block: int
+) -> tuple[Grid, ...]:
     """Return the frequency grid of each measured output, for rows that are means of `block` readings."""
     out, change = [], _changes(null, drives, block)
     outputs = list(null.model.plant.outputs.values())
