@@ -179,6 +179,16 @@ RULES: Mapping[str, Rule] = {
         {"search.beam.NEAR": float("inf")},
         searches=True,
     ),
+    "rivals": Rule(
+        "beside such a best, rivals at its effects' places are refitted by twice their promise",
+        {"search.beam._rival": _no},
+        searches=True,
+    ),
+    "far": Rule(
+        "a law depends on no node that acts only through two others",
+        {"law.signals._far": _nothing},
+        searches=True,
+    ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "pays": Rule(
         "beside a best that leaves only noise, laws compete only where a free function pays for one",

@@ -88,7 +88,10 @@ def without_slopes(
             below, above = (_reach(posterior, spot, k, side) for side in (-1, 1))
             out[k] = 2 * FALL / (0.5 * (below + above)) ** 2
             z[k] += 0.5 * (above - below)
-    middle = posterior.look(z, False) if out.any() else spot
+    try:
+        middle = posterior.look(z, False) if out.any() else spot
+    except SimulationError:
+        middle = spot
     return out, middle if middle.height > spot.height - FALL else spot
 
 

@@ -86,7 +86,7 @@ def places(rig: Rig) -> list[Place]:
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs.
 
-    A node that the plant links to the place through two or more others is none: it acts through these."""
+    A node that is linked to the place only through two or more others is no signal: it acts through these."""
     p, out = rig.physics, []
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
     for n in near:
@@ -110,7 +110,7 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
 
 
 def _far(p: Plant, place: Place) -> set[str]:
-    """Return the nodes that flows link to a place through two or more other nodes."""
+    """Return the nodes that flows link to a place only through two or more other nodes."""
     links = [{f.source or "", f.target or "", *ex.names(f.rate)} & p.nodes.keys() for f in p.flows.values()]
     rounds = [set(place.nodes)]
     for _ in range(max(len(p.nodes), BESIDE)):

@@ -17,6 +17,7 @@ from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
+from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
 from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
@@ -358,9 +359,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         own = ahead.fitted.hypothesis.keys
         if own not in quiet:
             quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        # a promise tells little between two effects at one place, as a lag and a delay of a reading
-        new = own - parent.fitted.hypothesis.keys
-        rival = any(d.candidate.key[1] == where for d in added for _, where in new)
+        rival = _rival(added, own - parent.fitted.hypothesis.keys)
         if parent.score + _reach(gain, ratio, quiet[own] and not rival) < ahead.score:
             return False
         case.budget.untried += case.budget.spent
@@ -391,6 +390,13 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
+
+
+def _rival(added: Sequence[Direction], leading: Keys) -> bool:
+    """Return whether an effect to add acts at the place of an effect of the leader.
+
+    A promise tells little between two effects at one place, as between a lag and a delay of a reading."""
+    return bool({d.candidate.key[1] for d in added} & {where for _, where in leading})
 
 
 def _reach(gain: float, ratio: float, quiet: bool) -> float:
