@@ -15,7 +15,7 @@ from thermoctl.diagnosis.data.columns import Columns
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.relabelled import absurd, relabelled
+from thermoctl.diagnosis.relabelled import absurd, likely, relabelled
 from thermoctl.plant import load, loads
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.recordings import read_recordings
@@ -65,7 +65,7 @@ def test_columns_are_swapped_in_the_rows_that_were_diagnosed():
 
     for read, fits in ((table, False), (swap(table), True)):
         known = case(plant, [read], catalogue((CATALOGUE,)), Budget(1))
-        again = Columns(known).changed(swap, Budget(1))
+        again = Columns(known).changed(swap, known.null.cost, Budget(1))
         assert known.block > 1 and (again is not None) is fits
         if again:
             assert sorted(g.count.sum() for g in again.grids) == sorted(g.count.sum() for g in known.grids)
@@ -94,6 +94,20 @@ def test_other_readings_are_evaluated_from_one_run(tmp_path):
     assert found.matrix == pytest.approx(exact.matrix, rel=1e-5, abs=1e-6 * exact.matrix.max())
     driven = dataclasses.replace(drives[0], u=drives[0].u + 1.0)
     assert Columns(known)._read([driven]) is None
+
+
+@pytest.mark.parametrize(
+    ("at", "after", "goal", "kept"),
+    [
+        (1.078, 1.065, 1.0, False),  # readings that are nearly alike: a fit moves nothing
+        (0.594, 0.580, 1.0, True),  # likelier as it is
+        (0.671, 0.659, 0.580, False),  # less likely than another pair
+        (6.49, 3.18, 1.0, True),  # swapped in a generated case; the refit ends at 0.016
+        (113.0, 56.6, 1.0, False),  # far worse: two of twelve bodies
+    ],
+)
+def test_pairs_that_no_refit_can_make_better_are_not_refitted(at, after, goal, kept):
+    assert likely(at, after, goal, 1.0) is kept
 
 
 @pytest.mark.parametrize(("gain", "refused"), [(1.79, True), (0.25, True), (1.1, False), (0.7, False)])

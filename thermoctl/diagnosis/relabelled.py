@@ -10,11 +10,13 @@ compared:
 A real plant is wrong in small ways, and each may change its evidence by hundreds of nats: so a misfit has to
 fall, too. An input and an output are no pair: a simulation that is driven by a reading predicts it without
 physics.
-Only a pair that improves the plant without effects by as much is searched for effects.
+Pairs are refitted in the order of their linear steps. Of those that improve the plant without effects by as
+much, the likeliest is searched for effects.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp, log
 
 import numpy as np
@@ -34,8 +36,11 @@ from thermoctl.plant.simulation.simulate import SimulationError
 # Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
 # degC.
 GAINS = (0.3, 1.5)
+# Limits of `likely`, which keeps 84 of 88 pairs that were swapped (python -m tests.truth.swaps).
+FAR_WORSE, TWICE = 5.0, 2.0
 HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all of it
 GAIN, SIZE = "sensor_gain", "A"
+FAILURES = SimulationError, InputError, np.linalg.LinAlgError  # a pair that cannot be read or simulated
 
 
 def relabelled(found: Diagnosis, limits: Thresholds) -> list[Finding]:
@@ -57,18 +62,20 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     pairs = [h for h in swaps(known.plant, known.tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Case] | None = None
-    columns = Columns(known)
-    for h in pairs:
+    columns, goal = Columns(known), known.null.cost
+    for at, after, h in _by_promise(columns, pairs):
+        if not likely(at, after, goal, known.null.cost):
+            continue
         budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
-            again = columns.changed(h.change, budget)
+            again = columns.changed(h.change, goal, budget)
             if again is None:
                 continue
             score = fitted(again, again.plant, (), again.null).log_evidence
-        except (SimulationError, InputError, np.linalg.LinAlgError):
+        except FAILURES:
             continue
         if score > now[frozenset()] + proof and (best is None or score > best[0]):
-            best = score, h, again
+            best, goal = (score, h, again), again.null.cost
     if best is None or known.budget.stopped():
         return None
     _, h, again = best
@@ -89,6 +96,24 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
         f"({exp(min(leader.score - max(now.values()), 200.0)):.0e} times as likely)",
         h.suggestion,
     )
+
+
+def likely(at: float, after: float, goal: float, recorded: float) -> bool:
+    """Return whether a refit may get from a cost `at` to `goal`: its linear step ends at `after`.
+
+    `recorded`: the cost of the columns as recorded."""
+    return after <= FAR_WORSE * recorded and at - goal <= TWICE * (at - after)
+
+
+def _by_promise(columns: Columns, pairs: Sequence[Hypothesis]) -> list[tuple[float, float, Hypothesis]]:
+    """Return the pairs with their costs before and after a linear step, the least cost after it first."""
+    found = []
+    for h in pairs:
+        try:
+            found.append((*columns.promised(h.change), h))
+        except FAILURES:
+            continue
+    return sorted(found, key=lambda item: item[1])
 
 
 def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:
