@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
+from tests.bench.scale import block_plant, recorded
+from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, signed_rank
 from thermoctl.diagnosis.verdict.decide import Probabilities
 
@@ -64,3 +66,19 @@ def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():
     test = with_errors({NONE: np.full(8, 50.0), ONE: np.full(8, 1.0)})
     test._known[ONE] = None
     assert test.probability(ONE, A) == 0.0
+
+
+def test_a_weak_effect_of_many_recordings_needs_no_proof_from_one_of_them(tmp_path):
+    """The recording set aside has a sixth of the information: too little for or against the link."""
+    plant, size = tmp_path / "plant.yaml", 0.02
+    link = f"{{from: block_1, into: block_3, rate: {size} * (block_1 - block_3), unit: W}}"
+    for k in range(6):
+        recorded(tmp_path / str(k), block_plant(3), link, 300, 10.0, 10.0, seed=300 + k)
+        (tmp_path / str(k) / "run_1.csv").rename(tmp_path / f"run_{k}.csv")
+    plant.write_text(block_plant(3))
+    found = diagnose_files(plant, [tmp_path / f"run_{k}.csv" for k in range(6)], tmp_path / "out")
+    assert found["verdict"] == "explained"
+    (named,) = found["findings"]
+    assert (named["effect"], named["where"]) == ("missing_link", "block_1-block_3")
+    g = named["parameters"]["G_missing_link_block_1_block_3"]
+    assert abs(g["value"] - size) < 3 * g["sd"]

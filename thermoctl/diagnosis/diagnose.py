@@ -160,12 +160,14 @@ def _chosen(
     chosen = supported(likeliest, physics)  # the other effects are part of the remainder
     if chosen not in tried:
         chosen = likeliest
-    law = any(key[0] == LAW for key in chosen)
     # beside known physics whose residual is only noise, there is no misfit that it could imitate
-    if sought.reserve or law or not only_noise(known, tried[chosen].fitted, numbers):
+    quiet = only_noise(known, tried[chosen].fitted, numbers) and not any(key[0] == LAW for key in chosen)
+    if sought.reserve or not quiet:
         fits = {keys: w.fitted for keys, w in tried.items()}
-        return confirmed(posterior, chosen, Confirm(known, fits, sought.reserve), numbers.name)
-    # but evidence that nothing else confirms counts less
+        found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve), numbers.name)
+        if found[0] == chosen or not quiet:
+            return found
+    # one recording set aside may know too little to confirm them; but evidence that nothing confirms counts less
     posterior = weigh(scores, physics, numbers.unasked)
     return (chosen if posterior.something >= numbers.name else frozenset()), posterior, {}
 
