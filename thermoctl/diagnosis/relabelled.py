@@ -10,8 +10,9 @@ compared:
 A real plant is wrong in small ways, and each may change its evidence by hundreds of nats: so a misfit has to
 fall, too. An input and an output are no pair: a simulation that is driven by a reading predicts it without
 physics.
-Pairs are refitted in the order of their linear steps. Of those that improve the plant without effects by as
-much, the likeliest is searched for effects.
+A pair is refitted if, swapped, it fits the plant file's own values better than as recorded: these do not
+depend on the columns. Of those that improve the plant without effects by as much, the likeliest is searched
+for effects.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
 from thermoctl.diagnosis.data.case import Budget, Case
-from thermoctl.diagnosis.data.columns import Columns
+from thermoctl.diagnosis.data.columns import changed, unfitted_cost
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
@@ -36,11 +37,8 @@ from thermoctl.plant.simulation.simulate import SimulationError
 # Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
 # degC.
 GAINS = (0.3, 1.5)
-# Limits of `likely`, which keeps 84 of 88 pairs that were swapped (python -m tests.truth.swaps).
-FAR_WORSE, TWICE = 5.0, 2.0
 HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all of it
 GAIN, SIZE = "sensor_gain", "A"
-FAILURES = SimulationError, InputError, np.linalg.LinAlgError  # a pair that cannot be read or simulated
 
 
 def relabelled(found: Diagnosis, limits: Thresholds) -> list[Finding]:
@@ -62,20 +60,19 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     pairs = [h for h in swaps(known.plant, known.tables) if len(inputs & {*h.columns}) != 1]
     proof = log(RARITY * max(len(pairs), 1))
     best: tuple[float, Hypothesis, Case] | None = None
-    columns, goal = Columns(known), known.null.cost
-    for at, after, h in _by_promise(columns, pairs):
-        if not likely(at, after, goal, known.null.cost):
-            continue
+    goal = known.null.cost
+    for h in better_unfitted(known, pairs):
         budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
         try:
-            again = columns.changed(h.change, goal, budget)
+            again = changed(known, [h.change(t) for t in known.tables], goal, budget)
             if again is None:
                 continue
+            goal = again.null.cost
             score = fitted(again, again.plant, (), again.null).log_evidence
-        except FAILURES:
+        except (SimulationError, InputError, np.linalg.LinAlgError):
             continue
         if score > now[frozenset()] + proof and (best is None or score > best[0]):
-            best, goal = (score, h, again), again.null.cost
+            best = score, h, again
     if best is None or known.budget.stopped():
         return None
     _, h, again = best
@@ -98,22 +95,11 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     )
 
 
-def likely(at: float, after: float, goal: float, recorded: float) -> bool:
-    """Return whether a refit may get from a cost `at` to `goal`: its linear step ends at `after`.
-
-    `recorded`: the cost of the columns as recorded."""
-    return after <= FAR_WORSE * recorded and at - goal <= TWICE * (at - after)
-
-
-def _by_promise(columns: Columns, pairs: Sequence[Hypothesis]) -> list[tuple[float, float, Hypothesis]]:
-    """Return the pairs with their costs before and after a linear step, the least cost after it first."""
-    found = []
-    for h in pairs:
-        try:
-            found.append((*columns.promised(h.change), h))
-        except FAILURES:
-            continue
-    return sorted(found, key=lambda item: item[1])
+def better_unfitted(known: Case, pairs: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the pairs that fit the plant file's own values better swapped, the best first."""
+    recorded = unfitted_cost(known, known.tables)
+    costs = [(unfitted_cost(known, [h.change(t) for t in known.tables]), h) for h in pairs]
+    return [h for cost, h in sorted(costs, key=lambda item: item[0]) if cost < recorded]
 
 
 def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:

@@ -91,10 +91,6 @@ class ResidualRows:
     w: np.ndarray
     weight: np.ndarray
 
-    def gram(self, weight: np.ndarray) -> np.ndarray:
-        """Return their part of the Gauss-Newton matrix (k, k) at weights (M,)."""
-        return _gram(self.jac, weight) * np.outer(self.slope, self.slope)
-
 
 class Evaluation(NamedTuple):
     """Cost, half its negative gradient, Gauss-Newton matrix, and raw residuals (N, ny) by recording."""
@@ -317,16 +313,17 @@ class Problem:
             if not len(whitening.index):
                 continue
             w = whitening.whiten(e[:, j])
-            own, weight = robust(w, huber[j])
-            cost += own
+            size, limit = np.abs(w), huber[j]
+            cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
             if run.dy is None:
                 continue
+            weight = np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
             dy = run.dy[:, j] if len(used) == run.dy.shape[2] else run.dy[:, j, used]
             rows = self._weighted(r, j, k, slope, w, weight, dy)
             if keeping:
                 kept.append(rows)
             gradient += rows.slope * (rows.jac.T @ (rows.weight * rows.w))
-            matrix += rows.gram(rows.weight)
+            matrix += _gram(rows.jac, rows.weight) * np.outer(rows.slope, rows.slope)
         return _Part(cost, k, gradient, matrix, e, kept)
 
     def prior_terms(self, values: np.ndarray, derivatives: bool) -> tuple[float, np.ndarray, np.ndarray]:
@@ -395,13 +392,6 @@ class Problem:
         if not own.white or len(own.index) < (1 - DOWNDATE_SHARE) * n:
             return ResidualRows(r, j, k, slope, own.whiten(jac), w, weight)
         return ResidualRows(r, j, k, slope / own.noise.sigma, jac, own.spread(w, n), own.spread(weight, n))
-
-
-def robust(w: np.ndarray, limit: float) -> tuple[float, np.ndarray]:
-    """Return the cost of whitened residuals (M,), and their weights (M,): Huber's beyond a limit."""
-    size = np.abs(w)
-    cost = float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
-    return cost, np.where(size <= limit, 1.0, limit / np.maximum(size, limit))
 
 
 def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
