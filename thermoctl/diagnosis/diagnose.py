@@ -167,7 +167,7 @@ def _chosen(
         found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve), numbers.name)
         if found[0] == chosen or not quiet:
             return found
-    # a recording set aside may know too little to confirm them; but evidence that nothing confirms counts less
+    # a recording set aside may know too little to confirm them; unconfirmed evidence counts less
     posterior = weigh(scores, physics, numbers.unasked)
     return (chosen if posterior.something >= numbers.name else frozenset()), posterior, {}
 
