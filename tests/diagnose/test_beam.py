@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.search import beam
+from thermoctl.diagnosis.search import beam, shortlist
 from thermoctl.diagnosis.search.beam import Search, Weighed, grow
 
 PLACE = "somewhere"
@@ -16,9 +16,10 @@ PLACE = "somewhere"
 def weighed(names: str, score: float) -> Weighed:
     """Return a hypothesis of effects of one letter each, with a score; nothing else of it is known."""
     keys = frozenset((name, PLACE) for name in names)
-    hypothesis = SimpleNamespace(keys=keys, effects=tuple(keys))
+    hypothesis = SimpleNamespace(keys=keys, effects=tuple(SimpleNamespace(key=k) for k in keys))
+    rough = SimpleNamespace(cost=-score)
     return Weighed(
-        SimpleNamespace(hypothesis=hypothesis, log_evidence=score, rough=SimpleNamespace(cost=-score)), 0.0
+        SimpleNamespace(hypothesis=hypothesis, log_evidence=score, rough=rough, doubtful=False), 0.0
     )
 
 
@@ -101,5 +102,30 @@ def test_a_rival_at_the_place_of_the_leading_effect_is_refitted_though_it_promis
     s = Known({})
     vars(s.case.budget).update(fits_done=0, planned=0, untried=0)
     s.best.fitted.log_likelihood = 0.0
-    found = beam.extensions(s, s.best, None)
+    found = beam.extensions(s, s.best, SimpleNamespace(directions=[], promises=[]))
     assert (("lag", where) in {k for w in found for k in w.fitted.hypothesis.keys}) == (where == "here")
+
+
+def test_what_is_left_of_the_best_meets_its_own_rivals(monkeypatch):
+    """Radiation at a wrong body was best beside a gain, and better alone; the right body was never refitted."""
+    s = Known({"": {"g": 40.0}, "g": {"gr": 60.0}})
+    grow(s)
+    s.case.budget.stopped = lambda: False
+    s.known[frozenset()] = {"g": 40.0, "t": 80.0}  # with the gain of r, the promise of t reaches the best
+    monkeypatch.setattr(beam, "rebuilt", lambda s, rest, *a: weighed(rest[0].key[0], 70.0))
+    beam.swap(s)
+    assert s.best.fitted.hypothesis.keys == {("t", PLACE)}
+
+
+@pytest.mark.parametrize(("promise", "tried"), [(30.0, True), (25.0, False)])
+def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, promise, tried):
+    monkeypatch.setattr(shortlist, "predicted", lambda d, promise, where, limits: promise)
+    effects = {name: SimpleNamespace(name=name) for name in ("radiation", "drift")}
+    promised = {("drift", "here"): 50.0, ("radiation", "here"): promise, ("radiation", "there"): 27.0}
+    directions = [
+        SimpleNamespace(candidate=SimpleNamespace(key=k, effect=effects[k[0]]), gain=1.0) for k in promised
+    ]
+    looked = SimpleNamespace(directions=directions, promises=[*promised.values()])
+    found = shortlist.elsewhere({("radiation", "there")}, looked, {}, limits())
+    assert (("radiation", "here") in {d.candidate.key for (d,), _ in found}) is tried
+    assert not [d for (d,), _ in found if d.candidate.key[0] == "drift"]

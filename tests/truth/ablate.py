@@ -159,7 +159,9 @@ RULES: Mapping[str, Rule] = {
         searches=True,
     ),
     "swap": Rule(
-        "each effect of the best meets rivals in its place", {"search.beam.swap": _nothing}, searches=True
+        "each effect of the best meets rivals in its place, and itself at other places",
+        {"search.beam.swap": _nothing, "search.beam.elsewhere": _none},
+        searches=True,
     ),
     "mistakes": Rule(
         "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,7 +23,7 @@ from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
-from thermoctl.diagnosis.search.shortlist import HALF, Extension, shortlist, simpler
+from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, predicted, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
@@ -212,11 +212,12 @@ def swap(s: Search) -> None:
     """Leave out each effect of the best hypothesis in turn, and extend the rest, until none replaces it.
 
     So each effect is compared with its rivals beside the same other effects, in whatever order the beam added
-    them. The rest is refitted even if the budget is spent: misfit.py compares the effect with it."""
+    them. The rest is refitted even if the budget is spent: misfit.py compares the effect with it. Where it is
+    the best, promises were compared without its gain: the rest of each of its effects is extended again."""
     while True:
         best = s.best
         effects = best.fitted.hypothesis.effects
-        for e in effects if len(effects) > 1 else ():
+        for e in effects if len(effects) > 1 or frozenset() not in s.seen else ():
             rest = tuple(o for o in effects if o is not e)
             if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
                 continue
@@ -225,6 +226,8 @@ def swap(s: Search) -> None:
                 continue
             if not parent.fitted.doubtful:
                 s.keep([parent])
+                if s.best is parent:
+                    s.seen -= {parent.fitted.hypothesis.keys - {o.key} for o in rest}
             s.extended(parent)
         if s.best is best:
             return
@@ -347,7 +350,11 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
-    queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
+    queue, planned = shortlist(looked, where, limits, paired=misfit), case.budget.later
+    ratio = max([1.0, *_ratios(s, parent, looked)])
+    first = max(tried.values(), key=lambda w: w.score).fitted.hypothesis.keys - parent.fitted.hypothesis.keys
+    listed = {d.candidate.key for added, _ in queue for d in added}
+    queue += [x for x in elsewhere(first, looked, where, limits) if x[0][0].candidate.key not in listed]
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
@@ -390,6 +397,14 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
+
+
+def _ratios(s: Search, parent: Weighed, looked: Screened) -> Iterator[float]:
+    """Yield the ratio of gain to prediction of each extension that was refitted on another way."""
+    for d, promise in zip(looked.directions, looked.promises, strict=True):
+        known = s.tried.get(parent.fitted.hypothesis.keys | {d.candidate.key})
+        if known:
+            yield (known.score - parent.score) / max(predicted(d, promise, s.where, s.limits), 1.0)
 
 
 def _rival(added: Sequence[Direction], leading: Keys) -> bool:
