@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,7 +23,7 @@ from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
-from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, predicted, shortlist, simpler
+from thermoctl.diagnosis.search.shortlist import HALF, Extension, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
@@ -350,11 +350,8 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
-    queue, planned = shortlist(looked, where, limits, paired=misfit), case.budget.later
-    ratio = max([1.0, *_ratios(s, parent, looked)])
-    first = max(tried.values(), key=lambda w: w.score).fitted.hypothesis.keys - parent.fitted.hypothesis.keys
-    listed = {d.candidate.key for added, _ in queue for d in added}
-    queue += [x for x in elsewhere(first, looked, where, limits) if x[0][0].candidate.key not in listed]
+    queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
+    queue += elsewhere(max(tried.values(), key=lambda w: w.score), parent, looked, queue)
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
@@ -399,12 +396,23 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
 
-def _ratios(s: Search, parent: Weighed, looked: Screened) -> Iterator[float]:
-    """Yield the ratio of gain to prediction of each extension that was refitted on another way."""
-    for d, promise in zip(looked.directions, looked.promises, strict=True):
-        known = s.tried.get(parent.fitted.hypothesis.keys | {d.candidate.key})
-        if known:
-            yield (known.score - parent.score) / max(predicted(d, promise, s.where, s.limits), 1.0)
+def elsewhere(
+    leader: Weighed, parent: Weighed, looked: Screened, queue: Sequence[Extension]
+) -> list[Extension]:
+    """Return the effect that the leader adds to its parent at other places, if it promised as much there.
+
+    It may gain there as much as at the leader's place."""
+    added = leader.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
+    known = added | {d.candidate.key for ds, _ in queue for d in ds}
+    promised = [*zip(looked.directions, looked.promises, strict=True)]
+    least = max((p for d, p in promised if d.candidate.key in added), default=np.inf)
+    names = {name for name, _ in added}
+    gain = leader.score - parent.score
+    return [
+        ((d,), gain)
+        for d, p in promised
+        if len(added) == 1 and p >= least and d.candidate.key[0] in names and d.candidate.key not in known
+    ]
 
 
 def _rival(added: Sequence[Direction], leading: Keys) -> bool:

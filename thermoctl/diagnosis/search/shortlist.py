@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
-from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.places import PLACES
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
@@ -99,22 +99,6 @@ def shortlist(
     if looked.energy:
         out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
     return out
-
-
-def elsewhere(
-    leading: Collection[Key], looked: Screened, where: Mapping[str, set[str]], limits: Thresholds
-) -> list[Extension]:
-    """Return the leading effects at other places that promised as much, each with its predicted gain."""
-    promised = [*zip(looked.directions, looked.promises, strict=True)]
-    least: dict[str, float] = {}
-    for d, promise in promised:
-        if d.candidate.key in leading:
-            least.setdefault(d.candidate.key[0], promise)
-    return [
-        ((d,), predicted(d, promise, where, limits))
-        for d, promise in promised
-        if d.candidate.key not in leading and promise >= least.get(d.candidate.key[0], np.inf)
-    ]
 
 
 def largest(looked: Screened) -> list[Direction]:
