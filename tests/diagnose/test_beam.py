@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.search import beam
+from thermoctl.diagnosis.search import beam, shortlist
 from thermoctl.diagnosis.search.beam import Search, Weighed, grow
 
 PLACE = "somewhere"
@@ -118,11 +118,11 @@ def test_what_is_left_of_the_best_meets_its_own_rivals(monkeypatch):
 
 
 @pytest.mark.parametrize(("promise", "tried"), [(30.0, True), (25.0, False)])
-def test_the_leading_effect_is_tried_where_it_promised_as_much(promise, tried):
+def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, promise, tried):
+    monkeypatch.setattr(shortlist, "relabels", lambda candidate: False)
     promised = {("drift", "here"): 50.0, ("radiation", "here"): promise, ("radiation", "there"): 27.0}
     directions = [SimpleNamespace(candidate=SimpleNamespace(key=k)) for k in promised]
     looked = SimpleNamespace(directions=directions, promises=[*promised.values()])
-    leader = weighed("", 60.0)
-    leader.fitted.hypothesis.keys = frozenset([("radiation", "there")])
-    found = beam.elsewhere(leader, weighed("", 0.0), looked, [])
+    found = shortlist.elsewhere({("radiation", "there")}, 60.0, looked, [])
     assert [(d.candidate.key, gain) for (d,), gain in found] == [(("radiation", "here"), 60.0)] * tried
+    assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked, [])

@@ -23,7 +23,7 @@ from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
-from thermoctl.diagnosis.search.shortlist import HALF, Extension, shortlist, simpler
+from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
@@ -217,6 +217,7 @@ def swap(s: Search) -> None:
     while True:
         best = s.best
         effects = best.fitted.hypothesis.effects
+        # the rest of a single effect is the plant alone, which is extended first of all
         for e in effects if len(effects) > 1 or frozenset() not in s.seen else ():
             rest = tuple(o for o in effects if o is not e)
             if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
@@ -351,7 +352,8 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
     queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
-    queue += elsewhere(max(tried.values(), key=lambda w: w.score), parent, looked, queue)
+    new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
+    queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
@@ -394,25 +396,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
-
-
-def elsewhere(
-    leader: Weighed, parent: Weighed, looked: Screened, queue: Sequence[Extension]
-) -> list[Extension]:
-    """Return the effect that the leader adds to its parent at other places, if it promised as much there.
-
-    It may gain there as much as at the leader's place."""
-    added = leader.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
-    known = added | {d.candidate.key for ds, _ in queue for d in ds}
-    promised = [*zip(looked.directions, looked.promises, strict=True)]
-    least = max((p for d, p in promised if d.candidate.key in added), default=np.inf)
-    names = {name for name, _ in added}
-    gain = leader.score - parent.score
-    return [
-        ((d,), gain)
-        for d, p in promised
-        if len(added) == 1 and p >= least and d.candidate.key[0] in names and d.candidate.key not in known
-    ]
 
 
 def _rival(added: Sequence[Direction], leading: Keys) -> bool:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
-from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
 from thermoctl.diagnosis.hypothesis.places import PLACES
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
@@ -99,6 +99,22 @@ def shortlist(
     if looked.energy:
         out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
     return out
+
+
+def elsewhere(
+    leading: Collection[Key], gain: float, looked: Screened, queue: Sequence[Extension]
+) -> list[Extension]:
+    """Return the one effect that leads at other places, if it promised as much there as where it leads.
+
+    It may gain there as much as it does (`gain`). Empty if several effects lead together."""
+    if len(leading) != 1:
+        return []
+    ((name, where),) = leading
+    listed = {d.candidate.key for added, _ in queue for d in added} | {(name, where)}
+    promised = [*zip(looked.directions, looked.promises, strict=True)]
+    least = max((p for d, p in promised if d.candidate.key == (name, where)), default=np.inf)
+    others = [d for d, p in promised if d.candidate.key[0] == name and p >= least]
+    return [((d,), gain) for d in others if d.candidate.key not in listed and not relabels(d.candidate)]
 
 
 def largest(looked: Screened) -> list[Direction]:
