@@ -19,7 +19,7 @@ from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import groups_of
 
 TOGETHER = 16  # number of periods whose columns are transformed at a time: one by one takes twice as long
-# A channel of all samples, and the weights of its rows: 0 for the rows that the screening has.
+# A channel of all samples, and the weights of its highest rows, which the screening lacks.
 Upper = tuple[Channel, np.ndarray]
 
 
@@ -28,8 +28,7 @@ def above(whole: Coordinates, inverse: Sequence[np.ndarray], screened: Coordinat
     low = {(c.recording, c.output): c.rows for c in screened.channels}
     out = []
     for c, v in zip(whole.channels, inverse, strict=True):
-        weight = np.sqrt(v)[c.band]
-        weight[: low.get((c.recording, c.output), c.rows)] = 0.0
+        weight = np.sqrt(v)[c.band[low.get((c.recording, c.output), c.rows) :]]
         if weight.any():
             out.append((c, weight))
     return out
@@ -47,8 +46,8 @@ def fine(
         return []
 
     def rows(e: Sequence[np.ndarray]) -> np.ndarray:
-        """Return whitened rows of the output's values (N, ...) by recording."""
-        return np.concatenate([(transform(k, e[k.recording]).T * w).T for k, w in own])
+        """Return the whitened highest rows of the output's values (N, ...) by recording."""
+        return np.concatenate([(transform(k, e[k.recording])[-len(w) :].T * w).T for k, w in own])
 
     residual = rows([d.y[:, j] - run.y[:, j] for d, run in zip(metric.drives, metric.runs, strict=True)])
     best: dict[int, Direction] = {}
@@ -58,8 +57,10 @@ def fine(
         columns = list(chain.from_iterable(each))
         d = rows([_changed(columns, at, j) for at in trajectories])
         edges = np.cumsum([len(one) for one in each])[:-1]
-        for one, x in zip(each, np.split(d, edges, axis=1), strict=True):
-            score(one, x, x.T @ residual, np.linalg.norm(x, axis=0), best)
+        # all columns at once: a few that lie apart in memory take several times as long
+        parts = (np.split(x, edges, axis=-1) for x in (d, d.T @ residual, np.linalg.norm(d, axis=0)))
+        for one, x, g, full in zip(each, *parts, strict=True):
+            score(one, x, g, full, best)
     return [dataclasses.replace(d, vector=None) for d in best.values() if d.gain > 0]
 
 
