@@ -4,7 +4,8 @@ A free function is a straight line between quantiles of the signal (`pieces`).""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -42,7 +43,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     combos = choices(rig, where, nodes, linear)
     moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
     both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
-    products = [(p, _along_both(linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
+    products = [(p, partial(_along_both, linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
     look, off = log_number(combos), cost_of(linear, PIECES) - cost_of(linear, 2)
     gains = [gain + off for gain, *_ in ranked(linear, combos)[:1]]
     gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
@@ -68,21 +69,23 @@ def unlikely(limits: Thresholds) -> float:
 
 def ranked(linear: Tracked, combos: Sequence[tuple[Place, Signal]]) -> list[tuple[float, Place, Signal]]:
     """Return the predicted gain of a free function of a signal at each place, the best first."""
-    gains = _gains(linear, [(p, _free(linear, s)) for p, s in combos])
+    gains = _gains(linear, [(p, partial(_free, linear, s)) for p, s in combos])
     return [(gain, *combos[k]) for gain, k in gains]
 
 
 def _gains(
-    linear: Tracked, functions: Sequence[tuple[Place, Sequence[np.ndarray]]]
+    linear: Tracked, functions: Sequence[tuple[Place, Callable[[], list[np.ndarray]]]]
 ) -> list[tuple[float, int]]:
     """Return the predicted gain of each free function at its place, and its position, the best first.
 
     Each knot costs half the log of the number of rows. The gain in likelihood is computed only for the RANKED
-    functions with the largest gain in energy, and only these are returned."""
-    energies = [energy(linear.columns(*f), linear.target) for f in functions]
+    functions with the largest gain in energy, and only these are returned. All columns together would fill
+    the memory: each is made when it is needed."""
+    energies = [energy(linear.columns(p, flows()), linear.target) for p, flows in functions]
     out = []
     for k in np.argsort(-np.array(energies), kind="stable")[:RANKED].tolist():
-        x = linear.columns(*functions[k])  # simulated again: thousands would fill the memory
+        place, flows = functions[k]
+        x = linear.columns(place, flows())
         out.append((predicted(linear, x)[0] - cost_of(linear, x.shape[1]), k))
     return sorted(out, key=lambda f: -f[0])
 
