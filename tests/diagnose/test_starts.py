@@ -79,3 +79,22 @@ def test_recorded_inputs_take_no_share_of_the_odds_that_a_sensor_is_slow():
     table = compile_plant(loads(TWO_BLOCKS)).measure(Table("run", "run", t, columns), seed=1)
     where = places(case(loads(TWO_BLOCKS), [table], catalogue(), Budget(80)))
     assert where["sensor_lag"] == where["sensor_delay"] == {"temperature_1", "temperature_2"}
+
+
+def test_a_loss_that_halves_while_the_plants_own_loss_imitates_it_is_found_at_its_time():
+    """At a small share of its size its time means next to nothing: the refit's first step took it to the end.
+
+    The joint that loosened was called an unknown law."""
+    t = np.arange(800) * 2.0
+    heat = np.take([0.0, 3.0, 1.0, 2.0], (t // 200).astype(int) % 4)
+    plant = TWO_BLOCKS.replace("noise: 0.1", "noise: 0.02")
+    halved = "G_2 * (1 - 0.5 * step(t - 300)) * (two - air)"
+    truth = plant.replace("G_2 * (two - air)", halved).replace("G_2: {value: 0.05", "G_2: {value: 0.08")
+    columns = {"heat": heat, "air_temperature": 22 + 0.4 * np.sin(t / 400)}
+    table = compile_plant(loads(truth)).measure(Table("run", "run", t, columns), seed=3)
+    found = diagnose(loads(plant), [table], catalogue(), limits())
+    assert found.decision.named == (("conductance_step", "loss_2"),)
+    values = {n: (p.value, found.best.sd[n]) for n, p in found.best.plant.parameters.items() if "step" in n}
+    for name, true in (("A_conductance_step_loss_2", -0.5), ("T0_conductance_step_loss_2", 300.0)):
+        value, sd = values[name]
+        assert abs(value - true) < 3 * sd

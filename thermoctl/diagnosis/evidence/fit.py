@@ -188,13 +188,14 @@ def _refitted(
     parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
-        first, there = first_point(posterior, parent.rough.cost if parent else np.inf)
+        first, there, held = first_point(posterior, parent.rough.cost if parent else np.inf)
         start = refit.fit(
             posterior.model,
             posterior.drives,
             case.noise,
             start=first,
             there=there,
+            held=held,
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,

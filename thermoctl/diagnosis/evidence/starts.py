@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from thermoctl.diagnosis.evidence.onsets import TIMES
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.plant.fitting.climb import bounded_step
@@ -14,21 +15,24 @@ from thermoctl.plant.simulation.simulate import SimulationError
 SHARE = 0.01  # share of an effect's size from which the first step towards its full size is taken
 
 
-def first_point(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evaluation | None]:
-    """Return the unknowns from which a refit starts, and their evaluation; None if it failed.
+def first_point(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evaluation | None, list[int]]:
+    """Return the unknowns where a refit starts, their evaluation, and the indices of those held at first.
 
-    They are the effects at full size, if these improve the fit. The plant's own parameters may have imitated
-    the effect. Then at full size the cost is above `parent`, the cost of the refit without the effect. In
-    that case one Gauss-Newton step is taken from a small share of the effect. Sizes and the plant's
-    parameters change in this step, shapes do not. The refit starts at full size, at the small share or after
-    the step, whichever has the least cost."""
+    The evaluation is None if it failed. The refit starts with the effects at full size, if these improve the
+    fit. The plant's own parameters may have imitated the effect. Then at full size the cost is above
+    `parent`, the cost of the refit without the effect. In that case one Gauss-Newton step is taken from a
+    small share of the effect. Sizes and the plant's parameters change in this step, shapes do not. The refit
+    starts at full size, at the small share or after the step, whichever has the least cost.
+
+    At a small share the time of a jump means next to nothing: a step may take it anywhere. So where a refit
+    does not start at full size, times are held until the other unknowns are fitted."""
     problem = posterior.problem
     full = problem.start({})
     starts = [(full, _evaluated(problem, full))]
     plant = posterior.plant.parameters
     names = {problem.unknowns[k][0]: p for k, (_, p) in posterior.sizes.items() if p.amplitude}
     if _cost(starts[0]) < parent or not names:
-        return starts[0]
+        return *starts[0], []
     small = problem.start({q: p.null + SHARE * (plant[q].value - p.null) for q, p in names.items()})
     own = {n for e in posterior.effects for n in e.own.values()}
     free = np.array([k for k, (q, _) in enumerate(problem.unknowns) if q not in own or q in names])
@@ -36,9 +40,16 @@ def first_point(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evalua
         now = problem.evaluate(small, True)
         stepped = _along_values(posterior, small, now, free)
     except SimulationError:
-        return starts[0]
+        return *starts[0], []
     starts += [(small, now), (stepped, _evaluated(problem, stepped))]
-    return min(starts, key=_cost)
+    best = min(starts, key=_cost)
+    return *best, [] if best is starts[0] else _times(posterior)
+
+
+def _times(posterior: Posterior) -> list[int]:
+    """Return the indices of the unknowns that are times of jumps."""
+    of = {e.own.get(p.name): p.shape for e in posterior.effects for p in e.candidate.effect.parameters}
+    return [k for k, (q, _) in enumerate(posterior.problem.unknowns) if of.get(q) in TIMES]
 
 
 def _evaluated(problem: Problem, z: np.ndarray) -> Evaluation | None:

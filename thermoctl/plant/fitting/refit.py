@@ -101,10 +101,12 @@ def fit(
     priors: Sequence[Prior] = (),
     progress: Callable[[str], None] | None = None,
     there: Evaluation | None = None,
+    held: Sequence[int] = (),
 ) -> Fit:
     """Fit the active parameters that have a range, and the uncertain initial states, to the recordings.
 
-    `there`: the evaluation at `start`, where it is known. `tries`: random starts over the ranges besides
+    `there`: the evaluation at `start`, where it is known. `held`: unknowns that stay until the others are
+    fitted. `tries`: random starts over the ranges besides
     `start`; the best KEPT_STARTS are followed. `seconds`: no iteration begins after so much CPU time of this
     thread. `goal`: stop where this cost is out of reach.
     Raises SimulationError if no start can be simulated, InputError if there is nothing to compare."""
@@ -118,7 +120,7 @@ def fit(
     failure: SimulationError | None = None
     for z in [z0, *_random_starts(problem, z0, tries, seed)]:
         try:
-            followed = _follow(problem, z, limits, best, there if z is z0 else None)
+            followed = _follow(problem, z, limits, best, there if z is z0 else None, held)
         except SimulationError as e:
             failure = failure or e
             continue
@@ -148,10 +150,17 @@ def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> l
 
 
 def _follow(
-    problem: Problem, z: np.ndarray, limits: _Limits, best: Fit | None, there: Evaluation | None
+    problem: Problem,
+    z: np.ndarray,
+    limits: _Limits,
+    best: Fit | None,
+    there: Evaluation | None,
+    held: Sequence[int],
 ) -> Fit | None:
     """Descend from a start, updating the outlier limits; None if it does not soon come below `best`."""
     problem.set_outlier_limits((there or problem.evaluate(z, False)).residuals)
+    if held:
+        z = _descend(problem, z, limits, held).z
     if best is not None:
         z = _descend(problem, z, dataclasses.replace(limits, iterations=PREVIEW)).z
         squares = _sum_of_squares(problem, problem.evaluate(z, False).residuals)
@@ -181,11 +190,13 @@ Found = tuple[Evaluation, list[ResidualRows] | None]  # an evaluation, and its r
 class _Misfit:
     """Minus half the cost of a problem, as a height to climb."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, z: np.ndarray, held: Sequence[int]):
         self.problem, self.few = problem, problem.few
         n, states = problem.n_parameters, len(problem.unknowns) - problem.n_parameters
         shift = np.full(states, MAX_SHIFT)
         self.bounds = np.append(np.zeros(n), -shift), np.append(np.ones(n), shift)
+        for bound in self.bounds:
+            bound[list(held)] = z[list(held)]
         self.rows: list[ResidualRows] = []  # where the climb stands
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[Found]:
@@ -210,14 +221,14 @@ class _Misfit:
         return self.problem.curvature(spot.z, step, self.rows)
 
 
-def _descend(problem: Problem, z: np.ndarray, limits: _Limits) -> Fit:
-    """Descend inside the bounds from z, until `limits` are reached."""
+def _descend(problem: Problem, z: np.ndarray, limits: _Limits, held: Sequence[int] = ()) -> Fit:
+    """Descend inside the bounds from z, until `limits` are reached; unknowns that are `held` stay."""
 
     def enough(height: float) -> float:
         """Return half of the tolerance at a height."""
         return 0.5 * limits.tolerance * max(1.0, -2e-3 * height)
 
-    top = climb(_Misfit(problem), z, limits.iterations, enough, -0.5 * limits.goal, limits.deadline)
+    top = climb(_Misfit(problem, z, held), z, limits.iterations, enough, -0.5 * limits.goal, limits.deadline)
     return _result(problem, top)
 
 
