@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -184,24 +185,26 @@ def _refitted(
 ) -> Fitted:
     """Refit a plant from one starting point; the arguments are those of `fitted`.
 
+    Where times may be held at first, the rough refit is made with and without, and the better one counts.
     A hypothesis contains its parent. A refit that ends with a lower likelihood starts again from the
     parent."""
     posterior = Posterior(case, plant, effects)
     if start is None:
         first, there, held = first_point(posterior, parent.rough.cost if parent else np.inf)
-        start = refit.fit(
+        rough = partial(
+            refit.fit,
             posterior.model,
             posterior.drives,
             case.noise,
             start=first,
             there=there,
-            held=held,
             iterations=WHITE,
             tolerance=ROUGH,
             goal=best.rough.cost if best else np.inf,
             priors=posterior.problem.priors,
             seconds=np.inf,
         )
+        start = min([rough(held=h) for h in dict.fromkeys(((), tuple(held)))], key=lambda f: f.cost)
     goal = best.log_likelihood - HOPELESS if best else -np.inf
     z = start.z.copy()
     z[posterior.shared] = posterior.past.z

@@ -16,7 +16,7 @@ SHARE = 0.01  # share of an effect's size from which the first step towards its 
 
 
 def first_point(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evaluation | None, list[int]]:
-    """Return the unknowns where a refit starts, their evaluation, and the indices of those held at first.
+    """Return the unknowns where a refit starts, their evaluation, and the indices of those to hold at first.
 
     The evaluation is None if it failed. The refit starts with the effects at full size, if these improve the
     fit. The plant's own parameters may have imitated the effect. Then at full size the cost is above
@@ -25,7 +25,7 @@ def first_point(posterior: Posterior, parent: float) -> tuple[np.ndarray, Evalua
     starts at full size, at the small share or after the step, whichever has the least cost.
 
     At a small share the time of a jump means next to nothing: a step may take it anywhere. So where a refit
-    does not start at full size, times are held until the other unknowns are fitted."""
+    does not start at full size, times may be held until the other unknowns are fitted."""
     problem = posterior.problem
     full = problem.start({})
     starts = [(full, _evaluated(problem, full))]
