@@ -146,12 +146,15 @@ def pairs(
     first = (g[:, None] - c * g[None]) / (1 - c**2)
     joint = g[:, None] * first + g[None] * first.T
     own = np.array([odds((Placed(d.candidate, {}),), where, limits) for d in kept])
-    alone = np.array([d.gain for d in kept])
-    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
-    worth = (extra > np.maximum.outer(alone, alone)) & (0.5 * joint + np.add.outer(own, own) > 0)
+    alone = 0.5 * np.array([d.gain for d in kept]) + own
+    together = 0.5 * joint + np.add.outer(own, own)
+    worth = np.triu(together > np.maximum(np.maximum.outer(alone, alone), 0.0), 1)
+    if alone.max() > 0:  # the foremost is extended by itself
+        first_of_all = int(np.argmax(alone))
+        worth[first_of_all], worth[:, first_of_all] = False, False
     out: list[Extension] = []
-    for k in np.argsort(np.where(worth, -extra, 0.0), axis=None, kind="stable")[: int(worth.sum())]:
-        a, b = np.unravel_index(k, extra.shape)
+    for k in np.argsort(np.where(worth, -together, np.inf), axis=None, kind="stable")[: int(worth.sum())]:
+        a, b = np.unravel_index(k, together.shape)
         pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
         if all(d is not None for d in pair):
             left = metric.residual - first[a, b] * v[a] - first[b, a] * v[b]

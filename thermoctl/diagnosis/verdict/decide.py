@@ -36,7 +36,7 @@ class Facts:
     - `remains`: the largest probability of a remainder at an output
     - `flow`: probability that a flow is missing which no output shows alone
     - `worth`: held-out error with the findings, divided by that of the refitted plant
-    - `worse`: probability that the held-out error is larger with the findings"""
+    - `worse`: probability that the error, of the held-out or of all data, is larger with the findings"""
 
     something: float
     known: float
@@ -100,7 +100,7 @@ ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
         "unexplained",
     ),
     (
-        "the findings predict held-out data worse than a refit alone",
+        "the findings follow the data, or predict those held out, worse than a refit alone",
         lambda f, q: f.worse >= q.name,
         "unexplained",
     ),
