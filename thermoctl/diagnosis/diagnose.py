@@ -32,11 +32,6 @@ from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
-# Ratio of the free run's errors with findings to those without, above which they are none. Of 843 diagnoses
-# one is above 1.001: 4.8.
-GROWN = 1.1
-
-
 @dataclass(frozen=True)
 class Sought:
     """All hypotheses that were tried, before a decision.
@@ -109,8 +104,6 @@ def decided(sought: Sought) -> Diagnosis:
     named = tuple(key for key in keys if posterior.effects[key] >= numbers.name)
     # data that took part in the choice cannot speak against it
     checked = bool(chosen) and value.reserved
-    # a remainder that absorbs slow errors lets a hypothesis follow the fast ones alone
-    grows = _ratio(after.over_noise, before.over_noise) > GROWN
     remains = remainder(known, tried[chosen].fitted)
     unknown = Missing()
     if remains < numbers.name:
@@ -125,8 +118,9 @@ def decided(sought: Sought) -> Diagnosis:
         over_noise=max(after.over_noise.values()),
         worth=_ratio(value.after, value.refit_only) if checked else 1.0,
         remains=remains,
-        worse=1.0 if grows else value.worse if checked else 0.0,
+        worse=value.worse if checked else 0.0,
         flow=unknown.probability,
+        grown=_ratio(after.over_noise, before.over_noise),
     )
     decision = decide(posterior, facts, numbers)
     diagnosis = Diagnosis(

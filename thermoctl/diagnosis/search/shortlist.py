@@ -132,10 +132,11 @@ def _constant(c: Candidate) -> bool:
 def pairs(
     directions: Sequence[Direction], metric: Metric, where: Mapping[str, set[str]], limits: Thresholds
 ) -> list[Extension]:
-    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
+    """Return pairs of constant physics, at their joint sizes, that promise more together than each alone.
 
-    The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
-    joint gain has to outweigh their prior odds."""
+    Prior odds are taken off. The plant's own parameters may imitate each effect of a pair alone, but not both
+    together. And a single effect may imitate a pair, none of which leads alone. The foremost candidate is in
+    no pair: it is extended by itself, where it finds its partners."""
     kept = once(d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate))
     if len(kept) < PAIR:
         return []
@@ -149,9 +150,8 @@ def pairs(
     alone = 0.5 * np.array([d.gain for d in kept]) + own
     together = 0.5 * joint + np.add.outer(own, own)
     worth = np.triu(together > np.maximum(np.maximum.outer(alone, alone), 0.0), 1)
-    if alone.max() > 0:  # the foremost is extended by itself
-        first_of_all = int(np.argmax(alone))
-        worth[first_of_all], worth[:, first_of_all] = False, False
+    leads = alone == max(alone.max(), 0.0)
+    worth[leads], worth[:, leads] = False, False
     out: list[Extension] = []
     for k in np.argsort(np.where(worth, -together, np.inf), axis=None, kind="stable")[: int(worth.sum())]:
         a, b = np.unravel_index(k, together.shape)
