@@ -21,8 +21,15 @@ outputs: {{housing_c: {{value: housing, unit: degC, noise: 0.1}}, tacho: {{value
 """
 
 
-@pytest.mark.parametrize("unit", ["rad/s", "m/s", "rpm"])
-def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
+STIRRED = {"forced_convection"}
+MOVED = {"eddy_heating", "hysteresis_heating", *STIRRED}
+
+
+@pytest.mark.parametrize(
+    ("unit", "names"),
+    [("rad/s", MOVED), ("m/s", MOVED), ("rpm", MOVED), ("kg/s", STIRRED), ("l/min", STIRRED)],
+)
+def test_what_a_speed_or_a_flow_does_is_offered_and_keeps_its_units(unit, names, tmp_path):
     (tmp_path / "plant.yaml").write_text(PLANT.format(unit=unit))
     plant = load(tmp_path / "plant.yaml")
     t = np.arange(100.0)
@@ -33,8 +40,7 @@ def test_heat_of_a_speed_is_offered_and_keeps_its_units(unit, tmp_path):
         {"heat": 1 + np.sin(t), "speed": np.cos(t), "air": np.full(100, 20.0), "housing_c": 20 + 0 * t},
     )
     rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
-    names = {"eddy_heating", "hysteresis_heating", "forced_convection"}
-    found = [c for c in candidates(rig, catalogue()) if c.effect.name in names]
+    found = [c for c in candidates(rig, catalogue()) if c.effect.name in MOVED]
     assert {c.effect.name for c in found} == names
     for c in found:
         save(c.extend({p.name: 0.1 for p in c.effect.parameters}), tmp_path / "extended.yaml")

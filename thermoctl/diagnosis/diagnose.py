@@ -32,6 +32,7 @@ from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
 
+
 @dataclass(frozen=True)
 class Sought:
     """All hypotheses that were tried, before a decision.

@@ -23,6 +23,8 @@ def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:
         found = rig.signals(need, place.nodes.get("v"))
         if need == "T" and effect.where == "displacement":
             found = sorted(ex.names(place.symbols["y"]) & set(found)) or found
+        if need == "v" and effect.where == "conductance":  # a fluid's flow stirs as a speed does
+            found = [*found, *rig.coolants()]
         choices = [{**c, need: name(s)} for c in choices for s in found if s != place.where]
     return choices
 

@@ -28,6 +28,7 @@ KELVIN = {"K", "kelvin"}
 ZERO_DEGC = 273.15  # K
 TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
 MOVING = ("velocity", "rotation")
+FLOWING = ("volume flow", "mass flow")
 # Kinds by unit of a node that structure makes a velocity, and of its position.
 RATES, PLACES = ("", *MOVING, "voltage"), ("", "length", "voltage")
 JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
@@ -46,6 +47,8 @@ _KINDS = {
     "voltage": "V",
     "power": "W",
     "volume": "m^3",
+    "volume flow": "m^3/s",
+    "mass flow": "kg/s",
 }
 _ROLE_KINDS = {"ambient": "temperature", "position": "length"}  # every other role is also the name of a kind
 # Nodes that an effect added to model a reading (lag, memory of the initial state) are no places.
@@ -238,6 +241,10 @@ class Rig:
         warm = [*self.temperatures, *(i for i in self.heat_inputs if i in self.moving_inputs)]
         silent = (c for c in self.spare if not any(c in self.guessed(k) for k in SOUNDS))
         return [*warm, *self.guessed("T"), *silent]
+
+    def coolants(self) -> list[str]:
+        """Return the inputs that are a flow of a fluid."""
+        return [i.name for i in self.physics.inputs.values() if self.kind(i) in FLOWING]
 
     def guessed(self, kind: str) -> list[str]:
         """Return the columns that the plant does not read and whose name suggests v, x, i or T."""
