@@ -130,13 +130,18 @@ def _constant(c: Candidate) -> bool:
 
 
 def pairs(
-    directions: Sequence[Direction], metric: Metric, where: Mapping[str, set[str]], limits: Thresholds
+    directions: Sequence[Direction],
+    metric: Metric,
+    where: Mapping[str, set[str]],
+    limits: Thresholds,
+    rivals: bool = False,
 ) -> list[Extension]:
-    """Return pairs of constant physics, at their joint sizes, that promise more together than each alone.
+    """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
-    Prior odds are taken off. The plant's own parameters may imitate each effect of a pair alone, but not both
-    together. And a single effect may imitate a pair, none of which leads alone. The foremost candidate is in
-    no pair: it is extended by itself, where it finds its partners."""
+    The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
+    joint gain has to outweigh their prior odds. With `rivals` the pairs are those that promise more together
+    than each alone, odds taken off: a single effect may imitate them, so that none of the two leads. The
+    foremost effect is in none of them: extended by itself, it finds its partners."""
     kept = once(d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate))
     if len(kept) < PAIR:
         return []
@@ -145,16 +150,18 @@ def pairs(
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
     # size of the first beside the second, along its unit vector
     first = (g[:, None] - c * g[None]) / (1 - c**2)
-    joint = g[:, None] * first + g[None] * first.T
     own = np.array([odds((Placed(d.candidate, {}),), where, limits) for d in kept])
-    alone = 0.5 * np.array([d.gain for d in kept]) + own
-    together = 0.5 * joint + np.add.outer(own, own)
-    worth = np.triu(together > np.maximum(np.maximum.outer(alone, alone), 0.0), 1)
-    leads = alone == max(alone.max(), 0.0)
-    worth[leads], worth[:, leads] = False, False
+    alone = np.array([d.gain for d in kept])
+    joint, better = g[:, None] * first + g[None] * first.T, np.maximum.outer(alone, alone)
+    score, scores = 0.5 * alone + own, 0.5 * joint + np.add.outer(own, own)
+    worth, rank = (joint > 2 * better) & (scores > 0), joint - better
+    if rivals:
+        worth, rank = scores > np.maximum(np.maximum.outer(score, score), 0.0), scores
+        worth[np.argmax(score)] = worth[:, np.argmax(score)] = False
+    worth = np.triu(worth, 1)
     out: list[Extension] = []
-    for k in np.argsort(np.where(worth, -together, np.inf), axis=None, kind="stable")[: int(worth.sum())]:
-        a, b = np.unravel_index(k, together.shape)
+    for k in np.argsort(np.where(worth, -rank, np.inf), axis=None, kind="stable")[: int(worth.sum())]:
+        a, b = np.unravel_index(k, worth.shape)
         pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
         if all(d is not None for d in pair):
             left = metric.residual - first[a, b] * v[a] - first[b, a] * v[b]
