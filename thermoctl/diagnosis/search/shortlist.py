@@ -141,8 +141,16 @@ def pairs(
     The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
     joint gain has to outweigh their prior odds. With `rivals` the pairs are those that promise more together
     than each alone, odds taken off: a single effect may imitate them, so that none of the two leads. The
-    foremost effect is in none of them: extended by itself, it finds its partners."""
-    kept = once(d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate))
+    foremost effect is in none of them: extended by itself, it finds its partners. Nor is a drift: any misfit
+    has a share of it."""
+    kept = once(
+        d
+        for d in directions
+        if d.vector is not None
+        and d.gain > 0
+        and _constant(d.candidate)
+        and not (rivals and d.candidate.effect.timed)
+    )
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
