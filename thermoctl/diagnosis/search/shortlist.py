@@ -140,9 +140,9 @@ def pairs(
 
     The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
     joint gain has to outweigh their prior odds. With `rivals` the pairs are those that promise more together
-    than each alone, odds taken off: a single effect may imitate them, so that none of the two leads. The
-    foremost effect is in none of them: extended by itself, it finds its partners. Nor is a drift: any misfit
-    has a share of it."""
+    than each alone, odds taken off. A single effect may imitate them, so that none of the two leads. The
+    foremost effect is in none of them: extended by itself, it finds its partners. Nor is a drift, of which
+    any misfit has a share."""
     kept = once(
         d
         for d in directions
