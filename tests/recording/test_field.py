@@ -57,6 +57,32 @@ def test_evidence_finds_the_clock(tmp_path, text, t):
     assert any(n.startswith("time from ") for n in found.notes)
 
 
+@pytest.mark.parametrize(
+    "header, scale",
+    [
+        ("Time (S)", 1), ("Time [Sec.]", 1), ("t (SEC)", 1), ("Runtime / S", 1), ("Time (MS)", 1e-3), ("Elapsed (mSec)", 1e-3),
+        ("Time [Min]", 60), ("TIME (MIN.)", 60), ("Zeit [H]", 3600), ("Time (Hr)", 3600),
+    ],
+)  # fmt: skip
+def test_a_unit_of_time_in_any_case(tmp_path, header, scale):
+    assert read(tmp_path, table(f"{header},T", "0,20", "3,22", "6,21")).t.tolist() == [
+        0,
+        3 * scale,
+        6 * scale,
+    ]
+    name, _, unit = header.partition(" ")
+    below = table(f"{name},T", f"{unit.strip('[(/) ]')},degC", "0,20", "3,22", "6,21")
+    assert read(tmp_path, below).t.tolist() == [0, 3 * scale, 6 * scale]
+
+
+def test_siemens_are_no_seconds(tmp_path):
+    with pytest.raises(InputError, match="unit S, increases evenly"):
+        read(tmp_path, table("Conductance (S),T", "0,20", "3,22", "6,21"))
+    text = table("Interval: 2 S", "Conductance (S),T", "0,20", "3,22", "6,21")
+    assert read(tmp_path, text).t.tolist() == [0, 2, 4]
+    assert read(tmp_path, table("x (MS),T", "0,20", "3,22"), time="x").t.tolist() == [0, 0.003]
+
+
 def test_an_assumed_unit_is_said(tmp_path):
     assert any("assumed: s" in n for n in read(tmp_path, table("time,T", "0,20", "1,21")).notes)
     assert any("a counter" in n for n in read(tmp_path, CLOCKS["a counter, for want of times"][0]).notes)

@@ -18,7 +18,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.axis import is_generic, named
 from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
-from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
+from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words, time_unit
 from thermoctl.units import SECONDS
 
 SAMPLE = 400  # number of first lines from which the dialect is found
@@ -452,11 +452,11 @@ def _aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str
             }
         elif (
             re.search(r"(?i)^(x_?|hor\w*[ _]?|h)(unit|einheit)", key)
-            and spelled(values[0]) in SECONDS
+            and time_unit(values[0])
             and names[0] not in units
             and named(names[0]) > 0
         ):
-            found[names[0]] = str(spelled(values[0]))
+            found[names[0]] = values[0]
     return found
 
 
@@ -479,12 +479,12 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
         if match is None:
             continue
         size = float(match[1].replace(",", "."))
-        if not _INTERVAL.search(key) and spelled(match[2]) not in SECONDS:
+        if not _INTERVAL.search(key) and not time_unit(match[2]):
             continue  # `Samples 600` states the number of samples, `Sampling 1s` their interval
         stated = (
             match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
         )
-        unit = spelled(stated) or ("Hz" if _RATE.search(key) else "s")
+        unit = time_unit(stated) or spelled(stated) or ("Hz" if _RATE.search(key) else "s")
         if unit in SECONDS and size > 0 and "rate" not in key:
             return size * SECONDS[unit], start
         if unit in ("Hz", "kHz", "MHz", "Sa/s", "S/s", "1/s") and size > 0:

@@ -245,7 +245,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
                 f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}"
             )
         try:
-            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen))
+            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen), True)
         except ClockError as e:
             raise InputError(f"{sheet.place(e.row)}: column '{chosen}': {e.reason}") from None
         return [(Clock((chosen,), seconds, 0, ""), [n for n in names if n != chosen])]

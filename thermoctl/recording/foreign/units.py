@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from thermoctl.units import conversion, dimension, ratio
+from thermoctl.units import SECONDS, conversion, dimension, ratio
 
 WORDS: dict[str, Any] = yaml.load(
     Path(__file__).with_name("words.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -40,6 +40,12 @@ def spelled(unit: str | None, name: str = "") -> str | None:
     unit = re.sub(r"°\s?F|℉|\bdeg\.? ?F\b", "degF", unit)
     unit = re.sub("Ω|Ω|Ohm", "ohm", unit)
     return unit if unit not in ("", "-", "–", "--") else None
+
+
+def time_unit(unit: str) -> str | None:
+    """Return the unit of a time in any case: s of `S` and `Sec.`, ms of `MSEC`; None for another unit."""
+    words = (unit, unit.lower().rstrip("."))
+    return next((short for word in words if (short := spelled(word)) in SECONDS), None)
 
 
 def known(unit: str) -> bool:
