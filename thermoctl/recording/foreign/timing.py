@@ -18,7 +18,7 @@ from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
 from thermoctl.recording.foreign.clock import ClockError
 from thermoctl.recording.foreign.sheet import How, Sheet
-from thermoctl.recording.foreign.units import split_unit
+from thermoctl.recording.foreign.units import column_of
 from thermoctl.recording.table import Table
 
 HOUR_S = 3600.0
@@ -237,8 +237,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
     if how.time is None and sheet.clock is not None:
         return [(Clock(("time of the channel",), sheet.clock, 0, ""), names)]
     if how.time is not None:
-        plain = split_unit(how.time)[0]
-        chosen = next((n for n in (how.time, plain) if n in names), None)
+        chosen = column_of(how.time, sheet.columns, sheet.units)
         if chosen is None:
             named = [n for n in names if n.strip() and "\0" not in n]
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,12 @@ def split_words(header: str) -> tuple[str, str | None]:
     ):
         return match[1], spelled(match[2], match[1])
     return name, unit
+
+
+def column_of(name: str, columns: Container[str], units: Mapping[str, str]) -> str | None:
+    """Return the column of a name, also of one with its unit, as in the file's header; None if there is none."""
+    plain, unit = split_words(name)
+    return name if name in columns else plain if plain in columns and unit == units.get(plain) else None
 
 
 def scale_between(unit: str | None, other: str | None) -> float | None:
