@@ -27,8 +27,7 @@ def read_recordings(
 
     A recording with a gap becomes parts (`plant.parts`).
 
-    `time`: the column of times; `columns`: name that the plant reads: name in the file; `how`: see
-    `sheet.How`."""
+    `columns`: name that the plant reads: name in the file; `time`, `how`: see `sheet.How`."""
     columns = _by_column(plant, columns or {})
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is Arrow's and numpy's
         read = pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns, **how)), paths)

@@ -39,7 +39,7 @@ def read_recording(
 ) -> Table:
     """Read a recording of any logger. Raises InputError with file and line.
 
-    `time`: the column of times (default: by the evidence of all columns). `columns`: wanted name: name in
+    `time`: see `How` (default: by the evidence of all columns). `columns`: wanted name: name in
     the file. `how`: the other fields of `How`. Units are in `units`, guesses in `notes`."""
     path, said = Path(path), How(time, **how)
     try:

@@ -16,11 +16,12 @@ from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign import axis, cells, clock
 from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
-from thermoctl.recording.foreign.clock import ClockError
+from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.sheet import How, Sheet
-from thermoctl.recording.foreign.units import column_of
+from thermoctl.recording.foreign.units import column_of, interval
 from thermoctl.recording.table import Table
 
+_ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
 HOUR_S = 3600.0
 _SINCE = re.compile(r", from \d{4}-\d\d-\d\d [\d:.]+( UTC)?")
 
@@ -238,10 +239,14 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         return [(Clock(("time of the channel",), sheet.clock, 0, ""), names)]
     if how.time is not None:
         chosen = column_of(how.time, sheet.columns, sheet.units)
+        if chosen is None and (step := interval(how.time)):
+            t = step * np.arange(len(sheet))
+            note = f"{step:g} s from row to row, as --time says"
+            return [(Clock((), Seconds(t, sheet.start, note, "unit"), 0, ""), names)]
         if chosen is None:
             named = [n for n in names if n.strip() and "\0" not in n]
             raise InputError(
-                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}"
+                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}; {_ADVICE}"
             )
         try:
             seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen), True)
@@ -256,7 +261,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         shown = ", ".join(n for n in names if n.strip() and "\0" not in n)
         raise InputError(
             f"{path}: no column 't' (time in seconds) and no other that is a time for sure ({e}); the columns are {shown}; "
-            "name it with --time COLUMN"
+            f"{_ADVICE}"
         ) from None
 
 

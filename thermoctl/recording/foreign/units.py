@@ -49,6 +49,13 @@ def time_unit(unit: str) -> str | None:
     return next((short for word in words if (short := spelled(word)) in SECONDS), None)
 
 
+def interval(text: str) -> float | None:
+    """Return the seconds of `0.08s` or `10 ms`; None for another text."""
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([^\W\d]+)", text.strip())
+    unit = time_unit(match[2]) if match else None
+    return float(match[1]) * SECONDS[unit] or None if match and unit else None
+
+
 def known(unit: str) -> bool:
     """Return whether a text is a unit by its symbols or words."""
     written = spelled(unit)
