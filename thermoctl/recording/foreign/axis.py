@@ -417,7 +417,7 @@ def _says_it(clock: Clock, stated: Clock) -> bool:
 
 
 def _stem(name: str) -> str:
-    return re.sub(r"[\d_\s.]+", "", name).lower()
+    return re.sub(r"[\d_\s.\0]+", "", name).lower()
 
 
 def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:
