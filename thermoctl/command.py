@@ -78,8 +78,9 @@ RECORDINGS = argument(
 )
 TIME = argument(
     "--time",
-    metavar="COLUMN",
-    help="the column of times (default: found by its cells, its name and unit, and that it increases)",
+    metavar="COLUMN|STEP",
+    help="the column of times (default: found by its cells, its name and unit, and that it increases); or the time from "
+    "row to row, such as 0.1s or '10 ms'",
 )
 COLUMNS = argument(
     "--columns",

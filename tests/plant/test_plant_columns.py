@@ -13,7 +13,7 @@ from thermoctl.plant.language import Conversion
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.plant.units import as_recorded, in_plant_units
-from thermoctl.recording.files import read_table
+from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.foreign.logger import read_recording
 from thermoctl.recording.table import Table
 from thermoctl.units import conversion
@@ -149,3 +149,31 @@ def test_commands_take_time_and_columns(tmp_path, capsys):
     )
     assert cli.main(["simulate", *options, "--columns", "heat=P"]) == 2
     assert "no column 'air'" in capsys.readouterr().err
+
+
+def read_as(folder, header, columns, heat="{unit: W, column: P}", time=None):
+    return read_recordings(plant_with(heat), [written(folder, header)], time, columns)[0].columns
+
+
+def test_a_column_by_its_name_in_the_header_or_without_its_unit(tmp_path):
+    for name in ("Input Power (mW)", "Input Power [mW]", "Input Power"):
+        found = read_as(tmp_path, "Time (S),Input Power (mW),air [degC]", {"P": name}, time="Time (S)")
+        np.testing.assert_allclose(found["P"], HEAT / 1e3)
+    with pytest.raises(InputError, match=r"no column 'Input Power \(kW\)'.*did you mean 'Input Power'"):
+        read_as(tmp_path, "t,Input Power (mW),air", {"P": "Input Power (kW)"})
+    both = read_as(tmp_path, "t,x (mW),air", {"P": "x (mW)", "spare": "x"})
+    np.testing.assert_allclose(both["spare"], 1e3 * both["P"])
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "arrow"])
+def test_a_unit_in_the_name_of_an_arrow_column(tmp_path, suffix):
+    made = Table("x", "x", T, {"P [mW]": HEAT, "air": AIR})
+    write_table(tmp_path / f"run.{suffix}", made)
+    (table,) = read_recordings(plant_with("{unit: W, column: P}"), [tmp_path / f"run.{suffix}"])
+    np.testing.assert_allclose(table.columns["P"], HEAT / 1e3)
+
+
+def test_columns_takes_the_name_of_an_input_that_has_a_column(tmp_path):
+    np.testing.assert_allclose(read_as(tmp_path, "t,x,air", {"heat": "x"})["P"], HEAT)
+    with pytest.raises(InputError, match="--columns P: .* reads column 'P' for it, which is given already"):
+        read_as(tmp_path, "t,x,air", {"heat": "x", "P": "air"})

@@ -294,6 +294,14 @@ def test_wrong_initial_is_refused(initial, words):
     assert str(e.value).startswith("p.yaml:1") and words in str(e.value)
 
 
+@pytest.mark.parametrize("old, new", [("initial: air", "initial: first(P)"), ("rate: heat", "rate: P")])
+def test_the_name_of_a_column_in_a_plant_names_its_reader(old, new):
+    text = BLOCK.replace("heat: {", "heat: {column: P, ", 1)
+    assert old in text and "column: P" in text
+    with pytest.raises(InputError, match="it is the column of 'heat': write 'heat'"):
+        loads(text.replace(old, new))
+
+
 def test_first_of_an_output_without_a_reading_is_an_error():
     plant = loads(BLOCK.replace("initial: air", "initial: first(y)"))
     with pytest.raises(InputError, match=r"first\(y\)"):

@@ -57,6 +57,60 @@ def test_evidence_finds_the_clock(tmp_path, text, t):
     assert any(n.startswith("time from ") for n in found.notes)
 
 
+@pytest.mark.parametrize(
+    "header, scale",
+    [
+        ("Time (S)", 1), ("Time [Sec.]", 1), ("t (SEC)", 1), ("Runtime / S", 1), ("Time (MS)", 1e-3), ("Elapsed (mSec)", 1e-3),
+        ("Time [Min]", 60), ("TIME (MIN.)", 60), ("Zeit [H]", 3600), ("Time (Hr)", 3600),
+    ],
+)  # fmt: skip
+def test_a_unit_of_time_in_any_case(tmp_path, header, scale):
+    assert read(tmp_path, table(f"{header},T", "0,20", "3,22", "6,21")).t.tolist() == [
+        0,
+        3 * scale,
+        6 * scale,
+    ]
+    name, _, unit = header.partition(" ")
+    below = table(f"{name},T", f"{unit.strip('[(/) ]')},degC", "0,20", "3,22", "6,21")
+    assert read(tmp_path, below).t.tolist() == [0, 3 * scale, 6 * scale]
+
+
+def test_siemens_are_no_seconds(tmp_path):
+    with pytest.raises(InputError, match="unit S, increases evenly"):
+        read(tmp_path, table("Conductance (S),T", "0,20", "3,22", "6,21"))
+    text = table("Interval: 2 S", "Conductance (S),T", "0,20", "3,22", "6,21")
+    assert read(tmp_path, text).t.tolist() == [0, 2, 4]
+    assert read(tmp_path, table("x (MS),T", "0,20", "3,22"), time="x").t.tolist() == [0, 0.003]
+
+
+@pytest.mark.parametrize("step, seconds", [("0.08s", 0.08), ("10 ms", 0.01), (".5 Min", 30), ("1 h", 3600)])
+def test_the_time_from_row_to_row(tmp_path, step, seconds):
+    for text in (table("u,y", "5,20", "3,22", "6,21"), "5 20\n3 22\n6 21\n"):
+        found = read(tmp_path, text, time=step)
+        np.testing.assert_allclose(found.t, [0, seconds, 2 * seconds])
+        assert f"{seconds:g} s from row to row, as --time says" in found.notes and len(found.columns) == 2
+    for wrong in ("10", "10 K", "0 s", "-1 s"):
+        with pytest.raises(
+            InputError, match=f"no column '{wrong}'.*time from row to row, such as --time 0.1s"
+        ):
+            read(tmp_path, text, time=wrong)
+
+
+@pytest.mark.parametrize(
+    "name, value, step", [("Ts", 0.2, 0.2), ("dt", 2, 2), ("Fs", 4, 0.25), ("sample_time", 0.5, 0.5)]
+)
+def test_matlab_states_its_interval(tmp_path, name, value, step):
+    savemat = pytest.importorskip("scipy.io").savemat
+    u, y = np.array([1.0, 0, 1, 1]), np.array([20.0, 22, 21, 20])
+    for content in (
+        {"u": u, "y": y, name: value},
+        {"run": {"u": u, "y": y, name: value}},
+        {"m": np.c_[u, y], name: value},
+    ):
+        savemat(tmp_path / "run.mat", content | {"T_room": 20.0})
+        np.testing.assert_allclose(read_recording(tmp_path / "run.mat").t, step * np.arange(4))
+
+
 def test_an_assumed_unit_is_said(tmp_path):
     assert any("assumed: s" in n for n in read(tmp_path, table("time,T", "0,20", "1,21")).notes)
     assert any("a counter" in n for n in read(tmp_path, CLOCKS["a counter, for want of times"][0]).notes)

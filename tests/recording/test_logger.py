@@ -98,7 +98,8 @@ def test_excel(tmp_path):
         ("t;x\n0;1,5\n1\n2;3,5\n", ":3: 1 cells; 2 as in the header were expected"),
         ("t;x\n0;1\n1;2\n1;3\n", ":4: the time 1 stands twice"),
         ("t;x\n0;1\n5;2\n1;3\n", ":4: the time 1 runs backwards from 5"),
-        ("t;x [K];x [K]\n0;1;1\n", ":1: the column 'x [K]' stands twice"),
+        ("t;x;x;x_1\n0;1;1;1\n", ":2: the column 'x' stands twice in the header"),
+        ("Time;x;Time;y\n0;1;5;1\n1;1;5;1\n2;1;5;1\n", ":2: the column 'Time' stands twice in the header"),
         ("a;b\n5;1\n3;2\n", "name it with --time COLUMN"),
         (
             "Zeit;x\n2026-03-14T09:26:53;1\n;2\n2026-03-14T09:26:55;2\n",
@@ -119,6 +120,30 @@ def test_a_mistake_is_one_line_with_its_place(tmp_path, text, says):
     with pytest.raises(InputError) as e:
         read_recording(path)
     assert says in str(e.value) and str(e.value).startswith(str(path)) and "\n" not in str(e.value)
+
+
+DOUBLED = {
+    "by a number": ("t,Loop,y,Loop\n0,1,2,3\n1,4,5,6\n", {"Loop_1": [1, 4], "y": [2, 5], "Loop_2": [3, 6]}),
+    "with a unit": ("t,Loop [K],Loop [K]\n0,1,2\n1,3,4\n", {"Loop_1": [1, 3], "Loop_2": [2, 4]}),
+    "an empty one": ("t,x,y,x\n0,1,2,\n1,4,5,\n", {"x": [1, 4], "y": [2, 5]}),
+    "no name": ("t [s],x,,\n0,1,2,\n1,4,5,\n", {"x": [1, 4], "column_3": [2, 5]}),
+    "blocks": ("Time,Loop,Time,Loop\n0,1,0,3\n1,4,0.5,6\n", {"Loop_1": [1, np.nan, 4], "Loop_2": [3, 6, np.nan]}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text, columns", DOUBLED.values(), ids=DOUBLED)
+def test_a_doubled_name_refuses_no_file(tmp_path, text, columns):
+    table = read_recording(written(tmp_path, text))
+    assert list(table.columns) == list(columns)
+    assert table.units == (dict.fromkeys(columns, "K") if "[K]" in text else {})
+    for name, values in columns.items():
+        np.testing.assert_array_equal(table.columns[name], values)
+    if "Loop_1" in columns:
+        assert "'Loop' stands 2 times in the header: called Loop_1, Loop_2" in table.notes
+        with pytest.raises(InputError, match="no column 'Loop'.*did you mean 'Loop_"):
+            read_recording(table.path, columns={"heat": "Loop"})
+    if "column_3" in columns:
+        assert "columns without a name: called column_3" in table.notes
 
 
 def test_every_guess_is_said_aloud(tmp_path):

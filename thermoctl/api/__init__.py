@@ -49,7 +49,7 @@ def read(
 
     `time`: the column of times; `columns`: name that a plant reads: name in the data. Raises InputError.
 
-    Of a file only:
+    Of a file only (`time` may then also be the time from row to row, such as "10 ms"):
 
     - `sheet`: sheet of Excel, group of TDMS, variable of MATLAB
     - `missing`: further words and numbers for "no value"

@@ -313,23 +313,30 @@ def _check_names(plant: Plant, items: Items) -> None:
         for e in ex.walk(p.expression):
             if e.op == "name" and e.value not in p.names:
                 exists = e.value in {*plant.inputs, *plant.parameters, *plant.nodes, "t"}
-                reason = "may not stand there" if exists else "is not known" + suggest(e.value, p.names)
+                reason = "may not stand there" if exists else "is not known" + _meant(e.value, plant, p.names)
                 raise p.node.error(
                     f"{p.what}: '{e.value}' {reason}; allowed are {', '.join(sorted(p.names))}"[:600]
                 )
             if e.op == "first":
-                _check_first(e, p, {*plant.inputs, *plant.outputs})
+                _check_first(e, p, plant)
             if e.op == "delay":
                 _check_delay(e, p, plant)
 
 
-def _check_first(e: Expr, p: _Place, recorded: set[str]) -> None:
+def _check_first(e: Expr, p: _Place, plant: Plant) -> None:
     if not p.first:
         raise p.node.error(f"{p.what}: first() may stand in 'initial' only")
+    recorded = {r.name for r in plant.readings()}
     if e.value not in recorded:
         raise p.node.error(
-            f"{p.what}: first({e.value}): '{e.value}' is neither input nor output{suggest(e.value, recorded)}"
+            f"{p.what}: first({e.value}): '{e.value}' is neither input nor output{_meant(e.value, plant, recorded)}"
         )
+
+
+def _meant(name: str, plant: Plant, allowed: set[str]) -> str:
+    """Return, for an error, the input or output whose column has this name; else a similar name."""
+    reader = next((r.name for r in plant.readings() if r.column == name and r.name in allowed), None)
+    return f"; it is the column of '{reader}': write '{reader}'" if reader else suggest(name, allowed)
 
 
 def _check_delay(e: Expr, p: _Place, plant: Plant) -> None:

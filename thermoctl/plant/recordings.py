@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import all_parts
 from thermoctl.plant.units import in_plant_units
@@ -26,8 +27,22 @@ def read_recordings(
 
     A recording with a gap becomes parts (`plant.parts`).
 
-    `time`: the column of times; `columns`: name that the plant reads: name in the file; `how`: see
-    `sheet.How`."""
+    `columns`: name that the plant reads: name in the file; `time`, `how`: see `sheet.How`."""
+    columns = _by_column(plant, columns or {})
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is Arrow's and numpy's
         read = pool.map(lambda p: in_plant_units(plant, read_recording(p, time, columns, **how)), paths)
         return all_parts(plant, list(read))
+
+
+def _by_column(plant: Plant, columns: Mapping[str, str]) -> dict[str, str]:
+    """Return `columns` with the column that the plant reads as key, in place of an input's or output's name."""
+    read = {r.column: r.column for r in plant.readings()}
+    own = {r.name: r.column for r in plant.readings()} | read
+    chosen: dict[str, str] = {}
+    for wanted, name in columns.items():
+        if (column := own.get(wanted, wanted)) in chosen:
+            raise InputError(
+                f"--columns {wanted}: {plant.file} reads column '{column}' for it, which is given already"
+            )
+        chosen[column] = name
+    return chosen

@@ -19,7 +19,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Input, Node, Output, Parameter, Plant
-from thermoctl.recording.foreign.units import split_unit
+from thermoctl.recording.foreign.units import column_of
 from thermoctl.recording.table import Table
 from thermoctl.units import Dimension, conversion, described, dimension, raised, times
 
@@ -202,11 +202,11 @@ def in_plant_units(plant: Plant, table: Table) -> Table:
     columns, units, notes = dict(table.columns), dict(table.units), list(table.notes)
     done: dict[str, tuple[float, float]] = {}
     for item in plant.readings():
-        plain = split_unit(item.column)[0]
-        if item.column not in columns and plain in columns:  # the plant names the header with its unit
-            columns[item.column], units[item.column] = columns.pop(plain), units.pop(plain, "")
-        if item.column not in columns:
+        name = column_of(item.column, columns, units)
+        if name is None:
             continue
+        if name != item.column:  # the plant names the header with its unit
+            columns[item.column], units[item.column] = columns.pop(name), units.pop(name, "")
         scale, offset = change = _conversion(plant, table, item, units.get(item.column))
         if done.setdefault(item.column, change) != change:
             raise InputError(

@@ -13,7 +13,7 @@ from thermoctl.plant.first import motion, tanks, template, thermal
 from thermoctl.plant.first.columns import COLDEST, HOTTEST, Column, quoted, recognise
 from thermoctl.plant.first.template import TEMPLATES
 from thermoctl.recording.foreign.logger import options, print_notes, read_recording
-from thermoctl.recording.foreign.units import split_unit
+from thermoctl.recording.foreign.units import column_of, split_unit
 from thermoctl.recording.table import Table
 
 HEATING = ("power", "current", "voltage", "duty")
@@ -58,9 +58,10 @@ def _from_recording(args: argparse.Namespace) -> str:
     columns = recognise(table, {**(inputs or {}), **(outputs or {})})
     if not args.template:
         return draft(table, columns, inputs, outputs)
-    for name in chosen.values():
-        if name not in columns:
+    for own, name in chosen.items():
+        if (column := column_of(name, columns, table.units)) is None:
             raise _no_column(table, name)
+        chosen[own] = column
     text, unused = template.mapped(args.template, table, columns, chosen)
     return text + _unread(table, unused)
 

@@ -235,8 +235,10 @@ class Model:
         def first(key: str) -> float:
             """Return the first recorded value of `key`. Raises InputError where the recording has none."""
             if key not in excitation.first:
+                column = next(r.column for r in self.plant.readings() if r.name == key)
                 raise InputError(
-                    f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it"
+                    f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it "
+                    f"(column '{column}')"
                 )
             return excitation.first[key]
 

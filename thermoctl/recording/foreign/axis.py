@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.sheet import Cells, Sheet
-from thermoctl.recording.foreign.units import WORDS, known, spelled
+from thermoctl.recording.foreign.units import WORDS, known, spelled, time_unit
 from thermoctl.units import SECONDS
 
 KINDS = {
@@ -117,11 +117,14 @@ def is_generic(name: str) -> bool:
     )
 
 
-def unit_of_time(name: str, unit: str | None) -> str | None:
-    """Return the unit of time that a header states, in brackets or as a word of the name."""
+def unit_of_time(name: str, unit: str | None, is_time: bool = False) -> str | None:
+    """Return the unit of time that a header states, in brackets or as a word of the name.
+
+    `is_time`: the column is a time whatever its name, so that S is the second and not the siemens."""
     if unit is not None:
-        short = spelled(re.sub(r"\s+", " ", unit))
-        return short if short in SECONDS else None
+        if is_time or named(name) > 0:
+            return time_unit(unit)
+        return short if (short := spelled(unit)) in SECONDS else None
     words = tokens(name)
     for word in reversed(words):
         short = spelled(word)
@@ -154,8 +157,10 @@ def _run(t: np.ndarray) -> tuple[int, str]:
 _MINUTES = re.compile(r"(?i)(?<![:\w])m+(?:in\w*)?:s")  # a header such as "Time (min:sec)"
 
 
-def read(name: str, cells: Cells, unit: str | None) -> Seconds:
-    """Return a column as seconds. Raises ClockError for one that cannot be a time."""
+def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Seconds:
+    """Return a column as seconds. Raises ClockError for one that cannot be a time.
+
+    `is_time`: see `unit_of_time`."""
     if isinstance(cells, np.ndarray):
         if cells.dtype.kind in "mM":
             return clock.from_stamps(cells)
@@ -167,7 +172,7 @@ def read(name: str, cells: Cells, unit: str | None) -> Seconds:
             t = np.full(len(cells), np.nan)
             t[there] = seconds.t
             return replace(seconds, t=t)
-        return clock.from_numbers(cells, unit_of_time(name, unit), named(name) > 0)
+        return clock.from_numbers(cells, unit_of_time(name, unit, is_time), named(name) > 0)
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
     minutes = clock.from_minutes(cells) if _MINUTES.search(f"{name} {unit or ''}") else None
@@ -412,7 +417,7 @@ def _says_it(clock: Clock, stated: Clock) -> bool:
 
 
 def _stem(name: str) -> str:
-    return re.sub(r"[\d_\s.]+", "", name).lower()
+    return re.sub(r"[\d_\s.\0]+", "", name).lower()
 
 
 def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from thermoctl.files.yamlfile import InputError
-from thermoctl.recording.foreign.axis import is_generic, named
+from thermoctl.recording.foreign.axis import named
 from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
-from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
+from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words, time_unit
 from thermoctl.units import SECONDS
 
 SAMPLE = 400  # number of first lines from which the dialect is found
@@ -303,8 +303,9 @@ def _header(
     split = [split_words(c) for c in cells]
     names = [n for n, _ in split]
     # If the names of two columns differ only by their units, the units stay part of the names.
-    names = [c if names.count(n) > 1 else n for c, n in zip(cells, names, strict=True)]
-    names = _distinct(path, line, names, data)
+    named_so = {n: {c for c, (m, _) in zip(cells, split, strict=True) if m == n} for n in names}
+    names = [c if len(named_so[n]) > 1 else n for c, n in zip(cells, names, strict=True)]
+    names = _distinct(names)
     units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}
     for number, row in below:
         if not _is_kinds(row):
@@ -375,19 +376,11 @@ def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list
     notes.append("the header has one name less than the rows have cells: it lacks the first column's name")
 
 
-def _distinct(path: Path, line: int, names: list[str], data: list[list[str]]) -> list[str]:
-    """Return names that differ: an index without a name is one blank; a clock may stand twice."""
-    distinct: list[str] = []
-    for i, name in enumerate(names):
-        if not name:
-            distinct.append(" " if i == 0 else f"\0{i}")
-        elif name in distinct and named(name) <= 0 and not is_generic(name) and any(row[i] for row in data):
-            raise InputError(f"{path}:{line}: the column '{name}' stands twice in the header; rename one")
-        elif name in distinct:
-            distinct.append(f"{name}\0{i}")
-        else:
-            distinct.append(name)
-    return distinct
+def _distinct(names: list[str]) -> list[str]:
+    """Return names that differ: an index without a name is one blank; a name used before gets \\0 and its place."""
+    if not names[0]:
+        names = [" ", *names[1:]]
+    return [name if name and name not in names[:i] else f"{name}\0{i}" for i, name in enumerate(names)]
 
 
 def _is_remarks(cells: list[str]) -> bool:
@@ -452,11 +445,11 @@ def _aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str
             }
         elif (
             re.search(r"(?i)^(x_?|hor\w*[ _]?|h)(unit|einheit)", key)
-            and spelled(values[0]) in SECONDS
+            and time_unit(values[0])
             and names[0] not in units
             and named(names[0]) > 0
         ):
-            found[names[0]] = str(spelled(values[0]))
+            found[names[0]] = values[0]
     return found
 
 
@@ -479,12 +472,12 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
         if match is None:
             continue
         size = float(match[1].replace(",", "."))
-        if not _INTERVAL.search(key) and spelled(match[2]) not in SECONDS:
+        if not _INTERVAL.search(key) and not time_unit(match[2]):
             continue  # `Samples 600` states the number of samples, `Sampling 1s` their interval
         stated = (
             match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
         )
-        unit = spelled(stated) or ("Hz" if _RATE.search(key) else "s")
+        unit = time_unit(stated) or spelled(stated) or ("Hz" if _RATE.search(key) else "s")
         if unit in SECONDS and size > 0 and "rate" not in key:
             return size * SECONDS[unit], start
         if unit in ("Hz", "kHz", "MHz", "Sa/s", "S/s", "1/s") and size > 0:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import pyarrow.compute as pc
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.clock import Seconds
+from thermoctl.recording.foreign.dialect import stated_step
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table
@@ -225,6 +227,7 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
     except Exception as e:  # any error on damaged bytes
         raise _damaged(path, "MATLAB", e) from None
     content = {k: v for k, v in content.items() if not k.startswith("__")}
+    step_s = _stated(content)
     if variable is not None:
         content = {variable: content[_chosen(path, variable, list(content), "variable")]}
     sheets: list[Sheet] = []
@@ -236,10 +239,12 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
                 columns = {str(value.index.name or "Time"): np.asarray(value.index), **columns}
             sheets.append(Sheet(columns, _row_of(path), name=name))
         elif len(columns := _vectors(value)) > 1:
-            sheets.append(Sheet(columns, _row_of(path), name=name))
+            sheets.append(Sheet(columns, _row_of(path), name=name, step_s=_stated(_fields(value))))
         elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
             loose[name] = np.squeeze(value).astype(float)
     sheets += _of_vectors(path, loose) or ([] if sheets else _of_matrices(path, loose))
+    for sheet in sheets:
+        sheet.step_s = sheet.step_s or step_s
     if len(sheets) > 1:
         sheets.sort(key=len, reverse=True)
         read = sheets[0].name or ", ".join(sheets[0].columns)
@@ -269,12 +274,32 @@ def _of_matrices(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
     return sheets
 
 
-def _vectors(value: Any) -> dict[str, Cells]:
-    """Return the vectors of a struct, also of dSPACE's X.Data and Y(k).Name, Y(k).Data."""
+def _stated(fields: Mapping[str, Any]) -> float | None:
+    """Return the sampling interval, s, that a number called Ts, dt, Fs or sample time states, if there is one."""
+    names = {"ts": "interval", "fs": "samplerate"}
+    numbers = {
+        n.lower(): v for n, v in fields.items() if np.size(v) == 1 and np.asarray(v).dtype.kind in "fiu"
+    }
+    facts = {
+        names.get(n, n): [f"{np.asarray(v).item():g}"]
+        for n, v in numbers.items()
+        if re.fullmatch("[tf]s|dt|.*sampl.*", n)
+    }
+    step = stated_step(facts)
+    return step[0] if step else None
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a single struct, by name."""
     if not isinstance(value, np.ndarray) or value.dtype.names is None or value.size != 1:
         return {}
     record = value.reshape(-1)[0]
-    fields = {n: record[n] for n in value.dtype.names}
+    return {n: record[n] for n in value.dtype.names}
+
+
+def _vectors(value: Any) -> dict[str, Cells]:
+    """Return the vectors of a struct, also of dSPACE's X.Data and Y(k).Name, Y(k).Data."""
+    fields = _fields(value)
     if (
         "X" in fields
         and "Y" in fields

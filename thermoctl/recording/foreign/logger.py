@@ -30,7 +30,7 @@ from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
 from thermoctl.recording.foreign.timing import table_of
-from thermoctl.recording.foreign.units import split_unit
+from thermoctl.recording.foreign.units import column_of, split_unit
 from thermoctl.recording.table import Table
 
 
@@ -39,17 +39,18 @@ def read_recording(
 ) -> Table:
     """Read a recording of any logger. Raises InputError with file and line.
 
-    `time`: the column of times (default: by the evidence of all columns). `columns`: wanted name: name in
+    `time`: see `How` (default: by the evidence of all columns). `columns`: wanted name: name in
     the file. `how`: the other fields of `How`. Units are in `units`, guesses in `notes`."""
     path, said = Path(path), How(time, **how)
     try:
         if _is_ours(path, said):
             try:
                 table = files.read_table(path)
-                said.trace.extend(
-                    ("format: " + kind_of(path), "time: 't': a table of numbers with a time in seconds")
-                )
-                return _renamed(table, columns or {})
+                if not any(split_unit(n)[1] for n in table.columns):
+                    said.trace.extend(
+                        ("format: " + kind_of(path), "time: 't': a table of numbers with a time in seconds")
+                    )
+                    return _renamed(table, columns or {})
             except InputError:
                 if path.is_dir() or path.suffix.lower() not in _TEXT:
                     raise
@@ -140,18 +141,19 @@ def _plain(path: Path) -> bool:
 def _renamed(table: Table, columns: Mapping[str, str]) -> Table:
     if not columns:
         return table
+    chosen: dict[str, str] = {}
     for wanted, name in columns.items():
-        if name not in table.columns:
+        if (column := column_of(name, table.columns, table.units)) is None:
             known = ", ".join(table.columns)
             raise InputError(
                 f"{table.path}: no column '{name}', which '{wanted}' shall be read from"
                 f"{suggest(name, table.columns)}; the columns are {known}"
             )
-    taken = {name: wanted for wanted, name in columns.items()}
-    # Drop a column that already has a wanted name, unless it is renamed too.
-    kept = {n: v for n, v in table.columns.items() if n in taken or n not in columns}
-    units = {taken.get(n, n): table.units[n] for n in kept if n in table.units}
-    return replace(table, columns={taken.get(n, n): v for n, v in kept.items()}, units=units)
+        chosen[wanted] = column
+    # A column that already has a wanted name is dropped, unless it is renamed too.
+    sources = {n: n for n in table.columns if n not in chosen.values()} | chosen
+    units = {n: table.units[c] for n, c in sources.items() if c in table.units}
+    return replace(table, columns={n: table.columns[c] for n, c in sources.items()}, units=units)
 
 
 def joined(parts: Sequence[Table]) -> Table:

@@ -22,7 +22,7 @@ EQUAL_TIMES = ("spread", "mean", "first", "last")
 class How:
     """Choices of a person about the reading of a file; the reader finds the others.
 
-    - `time`: column of times
+    - `time`: column of times, or the time from row to row, such as 0.1s
     - `sheet`: sheet of Excel, group of TDMS, variable of MATLAB
     - `missing`: further words and numbers for "no value"
     - `decimal`: the decimal sign

@@ -16,11 +16,12 @@ from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign import axis, cells, clock
 from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
-from thermoctl.recording.foreign.clock import ClockError
+from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.sheet import How, Sheet
-from thermoctl.recording.foreign.units import split_unit
+from thermoctl.recording.foreign.units import column_of, interval
 from thermoctl.recording.table import Table
 
+_ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
 HOUR_S = 3600.0
 _SINCE = re.compile(r", from \d{4}-\d\d-\d\d [\d:.]+( UTC)?")
 
@@ -150,23 +151,19 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         raise InputError(f"{path}: no rows; at least one sample was expected")
     tables: list[Table] = []
     several = _clocks(path, sheet, how)
+    final, said = _final_names(path, sheet, [n for _, names in several for n in names])
     for timer, names in several:
         _refuse_lost(sheet, timer)
         t = np.full(len(sheet), np.nan)
         t[: len(timer.seconds.t)] = timer.seconds.t
         values: dict[str, np.ndarray] = {}
-        notes = [_clock_note(timer, how)]
+        notes = [_clock_note(timer, how), *said]
         for name in names:
             column = sheet.columns[name]
-            plain = name.partition("\0")[0].strip()
             if not isinstance(column, np.ndarray) or column.dtype.kind != "f":
-                notes.append(f"another time left out: {plain}")
-                continue
-            if name.strip() != plain or not plain:
-                _refuse_name(path, sheet, name, plain, column)
-                if not plain:
-                    continue
-            values[plain] = column
+                notes.append(f"another time left out: {_plain(name)}")
+            elif name in final:
+                values[final[name]] = column
         t, values, place = _rows(path, sheet, t, values, len(several) > 1, how, notes)
         for name, column in values.items():
             if np.isinf(column).any():
@@ -174,7 +171,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
                     f"{place(int(np.isinf(column).argmax()))}: column '{name}': an infinite value; a finite number was "
                     "expected (leave the cell empty where a sample is missing)"
                 )
-        units = {n: u for n, u in sheet.units.items() if n in values}
+        units = {final[n]: u for n, u in sheet.units.items() if final.get(n) in values}
         start = timer.seconds.start or sheet.start
         if timer.seconds.start and len(t) and t[0] != 0:
             start, t = _moved(timer.seconds.start, float(t[0])), t - t[0]
@@ -209,13 +206,39 @@ def _moved(start: str, seconds: float) -> str:
     return f"{later}Z" if start.endswith("Z") else str(later)
 
 
-def _refuse_name(path: Path, sheet: Sheet, name: str, plain: str, column: np.ndarray) -> None:
-    if not np.isfinite(column).any() or name == " ":
-        return
-    if not plain:
-        position = list(sheet.columns).index(name)
-        raise InputError(f"{path}: column {position + 1} of {len(sheet.columns)} has no name in the header")
-    raise InputError(f"{sheet.place(0)}: the column '{plain}' stands twice in the header; rename one")
+def _plain(name: str) -> str:
+    """Return the name of a column as the header has it; several columns can have it."""
+    return name.partition("\0")[0].strip()
+
+
+def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Return the names in the table of the used columns, and notes: a doubled name gets a number, a missing one its place.
+
+    Left out are an index without a name, and empty columns whose name is missing or doubled. Raises InputError for
+    a second time of one name."""
+    every = list(sheet.columns)
+    alike: dict[str, list[str]] = {}
+    for name in used:
+        column = sheet.columns[name]
+        empty = isinstance(column, np.ndarray) and column.dtype.kind == "f" and not np.isfinite(column).any()
+        if name != " " and not ("\0" in name and empty):
+            alike.setdefault(_plain(name), []).append(name)
+    final: dict[str, str] = {}
+    notes = []
+    for plain, names in alike.items():
+        another_time = "\0" in names[-1] and axis.named(plain) > 0  # of which columns, nobody knows
+        if len(names) == 1 and plain and not another_time:
+            final[names[0]] = plain
+            continue
+        new = {
+            n: f"{plain}_{k + 1}" if plain else f"column_{every.index(n) + 1}" for k, n in enumerate(names)
+        }
+        if another_time or set(new.values()) & alike.keys():
+            raise InputError(f"{sheet.place(0)}: the column '{plain}' stands twice in the header; rename one")
+        final |= new
+        what = f"'{plain}' stands {len(names)} times in the header" if plain else "columns without a name"
+        notes.append(f"{what}: called {', '.join(new.values())}")
+    return final, notes
 
 
 def _clock_note(timer: Clock, how: How) -> str:
@@ -237,15 +260,18 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
     if how.time is None and sheet.clock is not None:
         return [(Clock(("time of the channel",), sheet.clock, 0, ""), names)]
     if how.time is not None:
-        plain = split_unit(how.time)[0]
-        chosen = next((n for n in (how.time, plain) if n in names), None)
+        chosen = column_of(how.time, sheet.columns, sheet.units)
+        if chosen is None and (step := interval(how.time)):
+            t = step * np.arange(len(sheet))
+            note = f"{step:g} s from row to row, as --time says"
+            return [(Clock((), Seconds(t, sheet.start, note, "unit"), 0, ""), names)]
         if chosen is None:
             named = [n for n in names if n.strip() and "\0" not in n]
             raise InputError(
-                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}"
+                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}; {_ADVICE}"
             )
         try:
-            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen))
+            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen), True)
         except ClockError as e:
             raise InputError(f"{sheet.place(e.row)}: column '{chosen}': {e.reason}") from None
         return [(Clock((chosen,), seconds, 0, ""), [n for n in names if n != chosen])]
@@ -257,7 +283,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         shown = ", ".join(n for n in names if n.strip() and "\0" not in n)
         raise InputError(
             f"{path}: no column 't' (time in seconds) and no other that is a time for sure ({e}); the columns are {shown}; "
-            "name it with --time COLUMN"
+            f"{_ADVICE}"
         ) from None
 
 

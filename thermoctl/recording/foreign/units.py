@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from thermoctl.units import conversion, dimension, ratio
+from thermoctl.units import SECONDS, conversion, dimension, ratio
 
 WORDS: dict[str, Any] = yaml.load(
     Path(__file__).with_name("words.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -40,6 +41,19 @@ def spelled(unit: str | None, name: str = "") -> str | None:
     unit = re.sub(r"°\s?F|℉|\bdeg\.? ?F\b", "degF", unit)
     unit = re.sub("Ω|Ω|Ohm", "ohm", unit)
     return unit if unit not in ("", "-", "–", "--") else None
+
+
+def time_unit(unit: str) -> str | None:
+    """Return the unit of a time in any case: s of `S` and `Sec.`, ms of `MSEC`; None for another unit."""
+    words = (unit, unit.lower().rstrip("."))
+    return next((short for word in words if (short := spelled(word)) in SECONDS), None)
+
+
+def interval(text: str) -> float | None:
+    """Return the seconds of `0.08s` or `10 ms`; None for another text."""
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*([^\W\d]+)", text.strip())
+    unit = time_unit(match[2]) if match else None
+    return float(match[1]) * SECONDS[unit] or None if match and unit else None
 
 
 def known(unit: str) -> bool:
@@ -77,6 +91,12 @@ def split_words(header: str) -> tuple[str, str | None]:
     ):
         return match[1], spelled(match[2], match[1])
     return name, unit
+
+
+def column_of(name: str, columns: Container[str], units: Mapping[str, str]) -> str | None:
+    """Return the column of a name, also of one with its unit, as in the file's header; None if there is none."""
+    plain, unit = split_words(name)
+    return name if name in columns else plain if plain in columns and unit == units.get(plain) else None
 
 
 def scale_between(unit: str | None, other: str | None) -> float | None:
