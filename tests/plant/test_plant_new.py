@@ -117,7 +117,19 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
             "t,T [degC]\n0,1\n1,2\n",
             "no column is recognised as it",
         ),
-        (["--from-csv", "a.csv"], "t,a,b\n0,1,3\n1,2,3\n", "write the units: --outputs 'COLUMN [degC]'"),
+        (["--from-csv", "a.csv"], "t,a,b\n0,1,3\n1,2,3\n", "--outputs 'a [UNIT]'; or take a template"),
+        (["--from-csv", "a.csv"], "t,U [V]\n0,1\n1,2\n", "known in 'U' [V] (voltage); take a template"),
+        (
+            ["--from-csv", "a.csv", "--outputs", "a [g]"],
+            "t,a\n0,1\n1,2\n",
+            "known in 'a' [g]; take a template",
+        ),
+        (["--from-csv", "a.csv", "--outputs", "a [foo]"], "t,a\n0,1\n1,2\n", "'foo' is not a unit"),
+        (
+            ["--from-csv", "a.csv", "--outputs", "force"],
+            "t,force\n0,1\n1,2\n",
+            "known in 'force' [N] (force); write its unit, as [degC] or [m]: --outputs 'force [UNIT]'",
+        ),
         (
             ["--from-csv", "a.csv", "--inputs", "b"],
             "t,T [degC],b\n0,1,3\n1,2,3\n",
@@ -129,7 +141,7 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
         (
             ["--from-csv", "a.csv", "--outputs", "P"],
             "t,P [W],T [degC]\n0,1,2\n1,2,2\n",
-            "'P' is no temperature",
+            "none is known in 'P' [W] (power); take a template that is near",
         ),
         (["--from-csv", "a.csv", "--inputs", "Q"], "t,P [W],T [degC]\n0,1,2\n1,2,2\n", "no column 'Q'"),
         (["--from-csv", "a.csv"], "t,P [W],T [degC]\n0,1,2\n1,2,2\n", "2 values; 8 or more were expected"),
@@ -205,7 +217,7 @@ def test_columns_without_units_are_recognised_and_never_a_power(folder, names, c
 def test_a_unit_by_hand_and_a_name_that_says_nothing(folder, capsys):
     heated(folder, ("a", "b", "c"))
     assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 2
-    assert "write the units" in capsys.readouterr().err and not (folder / "p.yaml").exists()
+    assert "write its unit" in capsys.readouterr().err and not (folder / "p.yaml").exists()
     args = ["--inputs", "a [mW], b [degC]", "--outputs", "c [degC]"]
     assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *args]) == 0
     plant = load("p.yaml")
@@ -285,6 +297,29 @@ def test_an_axis_becomes_mass_friction_and_a_spring_if_it_has_one(folder, stiffn
     values = {n: p.value for n, p in plant.parameters.items()}
     assert values["mass"] == pytest.approx(2.0, rel=0.1) and values["damping"] == pytest.approx(6.0, rel=0.1)
     assert values.get("stiffness", 0.0) == pytest.approx(stiffness, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "unit, kind, factor",
+    [
+        *(("deg/s", "rad/s", np.pi / 180), ("°/s", "rad/s", np.pi / 180), ("rpm", "rad/s", np.pi / 30)),
+        *(("mrad/s", "rad/s", 1e-3), ("turn/min", "rad/s", np.pi / 30), ("mrad", "rad", 1e-3)),
+        *(("km/h", "m/s", 1 / 3.6), ("mm/s", "m/s", 1e-3), ("turn", "rad", 2 * np.pi)),
+    ],
+)
+def test_every_unit_of_an_angle_or_a_velocity_is_one(folder, unit, kind, factor):
+    t = np.arange(0.0, 20.0, 0.02)
+    force, x = swung(t, 2.0, 6.0, 0.0)
+    drive = "N*m" if "rad" in kind else "N"
+    moved = x[int("/s" in kind)] / factor
+    rows = "\n".join(f"{a:g},{b:.5f},{c:.8g}" for a, b, c in zip(t, force, moved, strict=True))
+    (folder / "a.csv").write_text(f"t,a,b\n{rows}\n")
+    options = ["--inputs", f"a [{drive}]", "--outputs", f"b [{unit}]"]
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *options]) == 0
+    plant = load("p.yaml")
+    assert plant.outputs["b"].unit == kind
+    size = plant.parameters["inertia" if "rad" in kind else "mass"].value
+    assert (size, plant.parameters["damping"].value) == pytest.approx((2.0, 6.0), rel=0.1)
 
 
 def test_levels_and_a_pump_become_tanks(folder):
