@@ -136,8 +136,9 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
             "tells what 'b' is (from 3 to 3)",
         ),
         (["--template", "blok"], "", "did you mean 'block'"),
-        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "recognised as what moves it"),
-        (["--from-csv", "a.csv"], "t,T [degC]\n0,1\n1,2\n", "recognised as what heats it"),
+        (["--from-csv", "a.csv"], "t,x [m],b\n0,1,1\n1,2,2\n", "recognised as what moves it"),
+        (["--from-csv", "a.csv"], "t,T [degC],b\n0,1,1\n1,2,2\n", "'b [W]', or none: --inputs ''"),
+        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "2 values; 8 or more were expected"),
         (
             ["--from-csv", "a.csv", "--outputs", "P"],
             "t,P [W],T [degC]\n0,1,2\n1,2,2\n",
@@ -320,6 +321,59 @@ def test_every_unit_of_an_angle_or_a_velocity_is_one(folder, unit, kind, factor)
     assert plant.outputs["b"].unit == kind
     size = plant.parameters["inertia" if "rad" in kind else "mass"].value
     assert (size, plant.parameters["damping"].value) == pytest.approx((2.0, 6.0), rel=0.1)
+
+
+def swing(t):
+    """A mass of 1 on a spring of 40 N/m with 0.3 N*s/m, let go at 0.2 m; its rest is at 0.05 m."""
+    w = (40 - 0.15**2) ** 0.5
+    return 0.05 + 0.15 * np.exp(-0.15 * t) * (np.cos(w * t) + 0.15 / w * np.sin(w * t))
+
+
+FREE = {  # header, options, values over time, and the parameters that made them
+    "swing": ("x [mm]", "", lambda t: 1e3 * swing(t), {"stiffness": 40, "damping": 0.3, "rest": 0.05}),
+    "gyro": (
+        "w [deg/s]",
+        "",
+        lambda t: np.rad2deg(np.gradient(swing(t), t)),
+        {"stiffness": 40, "damping": 0.3},
+    ),
+    "coasting": ("v [km/h]", "", lambda t: 30 * np.exp(-0.05 * t), {"damping": 0.05}),
+    "rolling out": ("x [m]", "", lambda t: 4 * (1 - np.exp(-0.1 * t)), {"damping": 0.1}),
+    "cooling": ("T [degC]", "", lambda t: 21 + 60 * np.exp(-t / 15), {"T_ambient": 21, "G_body_T": 1 / 15}),
+    "warming": ("T [degC]", "", lambda t: 21 - 40 * np.exp(-t / 25), {"T_ambient": 21, "G_body_T": 1 / 25}),
+    "in air": (
+        "T [degC],air [degC]",
+        "",
+        lambda t: (21 + 9 * np.exp(-t / 9), 21 + 0 * t),
+        {"G_body_T": 1 / 9},
+    ),
+    "emptying": ("h [cm]", "h [cm]", lambda t: 100 * (0.7 - 0.01 * t) ** 2, {"outlet_tank_h": 0.02}),
+    "beside": ("x [mm],rh [%]", "x", lambda t: (1e3 * swing(t), 50 + t), {"stiffness": 40, "damping": 0.3}),
+}
+
+
+@pytest.mark.parametrize("kind", FREE)
+def test_a_free_motion_a_cooling_and_an_emptying_need_no_input(folder, kind, capsys):
+    header, outputs, course, truth = FREE[kind]
+    t = np.arange(0.0, 40.0, 0.02)
+    columns = np.atleast_2d(course(t))
+    columns = columns + np.random.default_rng(3).normal(0, 1e-3, columns.shape) * np.ptp(columns[:1])
+    rows = "\n".join(",".join(f"{v:.7g}" for v in row) for row in zip(t, *columns, strict=True))
+    (folder / "a.csv").write_text(f"t,{header}\n{rows}\n")
+    options = ["--outputs", outputs, "--inputs", ""] if outputs else []
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *options]) == 0
+    assert (
+        cli.main(["plant", "check", "p.yaml"])
+        == cli.main(["plant", "check", "p.yaml", "--data", "a.csv"])
+        == 0
+    )
+    plant = load("p.yaml")
+    assert all(i.role == "ambient" for i in plant.inputs.values())
+    assert [p.value for p in plant.parameters.values() if p.range is None] == [1]
+    assert {n: plant.parameters[n].value for n in truth} == pytest.approx(truth, rel=0.1)
+    assert cli.main(["refit", "--plant", "p.yaml", "a.csv", "--out", "o.yaml"]) == 0
+    refitted = load("o.yaml").parameters
+    assert {n: refitted[n].value for n in truth} == pytest.approx(truth, rel=0.01)
 
 
 def test_levels_and_a_pump_become_tanks(folder):

@@ -210,7 +210,9 @@ def _inputs(
     sensors: Sequence[Column],
     does: str,
 ) -> list[Column]:
-    """Return the inputs, by `named`, else by kind. Raises InputError for none or a wrong kind."""
+    """Return the inputs, by `named`, else by kind; none where only sensors are recorded or `named` is empty.
+
+    Raises InputError for a wrong kind, and where an unknown column may be the input."""
     if named is None:
         drives = [
             c for c in columns.values() if c.kind in kinds and c.kind != "temperature" and c not in sensors
@@ -224,11 +226,11 @@ def _inputs(
                 raise InputError(
                     f"{table.path}: input '{c.name}'{_taken(c)}: one of {', '.join(kinds)} was expected"
                 )
-    if not [c for c in drives if c.kind != "temperature"]:
-        rest = [c.name for c in columns.values() if c not in sensors and c.kind != "temperature"]
+    rest = [c.name for c in columns.values() if c not in sensors and c.kind != "temperature"]
+    if named is None and rest and not drives:
         raise InputError(
             f"{table.path}: no column is recognised as what {does} it: {', '.join(k for k in kinds if k != 'temperature')}"
-            f"; name one with its unit, such as --inputs '{rest[0] if rest else 'COLUMN'} [{'W' if does == 'heats' else 'N'}]'"
-            f" (columns {', '.join(table.columns)}), or use a template: {', '.join(TEMPLATES)}"
+            f"; name one with its unit, such as --inputs '{rest[0]} [{'W' if does == 'heats' else 'N'}]', or none: "
+            f"--inputs '' (columns {', '.join(table.columns)}), or use a template: {', '.join(TEMPLATES)}"
         )
     return drives
