@@ -43,6 +43,7 @@ def test_inputs_alone_are_enough(folder, capsys, initial, start):
     assert got == pytest.approx([start, 20 + (warm - 20) * np.exp(-1)], rel=1e-5)
     assert ("steady state of the first inputs, block = 40 degC" in printed.err) == (not initial)
     assert "highest" in printed.out
+    assert "note: step.csv: no column 'T', which an output of p.yaml reads;" in printed.err
 
 
 def test_a_forecast_goes_on_from_a_recordings_last_state(folder, capsys):
@@ -67,13 +68,14 @@ def test_a_forecast_goes_on_from_a_recordings_last_state(folder, capsys):
         ("blok=3", "no such node (did you mean 'block'?)"),
         ("block=warm", "--initial block=warm: NODE=VALUE"),
         ("nothing.csv", "nothing.csv"),
-        ("step.csv", "has no reading of T"),
+        ("step.csv", "no column 'T', which an output of p.yaml reads"),
     ],
 )
 def test_a_wrong_initial_value_is_one_line(folder, capsys, given, says):
     assert cli.main(["simulate", "--plant", "p.yaml", "step.csv", "--initial", given]) == 2
     error = capsys.readouterr().err
-    assert says in error and len(error.splitlines()) == 1
+    notes, (last,) = error.splitlines()[:-1], error.splitlines()[-1:]
+    assert says in last and all(n.startswith("note: ") for n in notes)
 
 
 def test_a_plant_without_a_steady_state_asks_for_values(folder):

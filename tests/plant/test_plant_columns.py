@@ -148,7 +148,56 @@ def test_commands_take_time_and_columns(tmp_path, capsys):
         read_table(tmp_path / "o.csv").columns["temperature_simulated"], expected, atol=2e-3
     )
     assert cli.main(["simulate", *options, "--columns", "heat=P"]) == 2
-    assert "no column 'air'" in capsys.readouterr().err
+    assert "no column 'air', which an input of" in (error := capsys.readouterr().err)
+    assert (
+        "does not read: T_air; name one: --columns air=T_air" in error and "a parameter of the plant" in error
+    )
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "--plant"],
+        ["refit", "--plant"],
+        ["plant", "check"],
+        ["diagnose", "--out", "o", "--plant"],
+    ],
+)
+@pytest.mark.parametrize("header", ["t,heat,air,Temperature", "t,heat,air,TEMPERATURE [degC]"])
+def test_a_recording_without_any_output_names_the_near_column(tmp_path, capsys, monkeypatch, command, header):
+    """Only a simulation goes on without readings; the named option mends every command."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.yaml").write_text(ONE_BLOCK)
+    rows = "\n".join(f"{t:g},{h:g},{a:g},22" for t, h, a in zip(T, HEAT, AIR, strict=True))
+    (tmp_path / "run.csv").write_text(f"{header}\n{rows}\n")
+    line = [*command, "p.yaml", *(["--data"] if "check" in command else []), "run.csv"]
+    assert cli.main(line) == (0 if "simulate" in command else 2)
+    name = header.split(",")[-1].split()[0]
+    wanted = (
+        "run.csv: no column 'temperature', which an output of p.yaml reads; columns that it does not read: "
+        f"{name}; name one: --columns temperature={name}"
+    )
+    assert wanted in capsys.readouterr().err
+    if "simulate" in command:
+        assert cli.main([*line, "--columns", f"temperature={name}"]) == 0
+        printed = capsys.readouterr()
+        assert "rms error" in printed.out and "no column" not in printed.err
+
+
+def test_an_input_that_was_constant_is_a_parameter_of_each_recording(tmp_path, capsys, monkeypatch):
+    """The heat is in the files' names, not in the files: 3 W and 1 W, with 6 J/K and 0.08 W/K to air of 22 degC."""
+    monkeypatch.chdir(tmp_path)
+    heat = "  heat: {value: 0, unit: W, per_recording: true, values: {run_3: 3, run_1: 1}}\n"
+    text = ONE_BLOCK.replace("  heat: {unit: W}\n", "").replace("parameters:\n", f"parameters:\n{heat}")
+    (tmp_path / "p.yaml").write_text(text)
+    for watts in (3, 1):
+        warm = 22 + watts / 0.08 * (1 - np.exp(-T * 0.08 / 6))
+        rows = "\n".join(f"{t:g},22,{v:.6f}" for t, v in zip(T, warm, strict=True))
+        (tmp_path / f"run_{watts}.csv").write_text(f"t,air,temperature\n{rows}\n")
+    assert cli.main(["refit", "--plant", "p.yaml", "run_3.csv", "run_1.csv", "--out", "o.yaml"]) == 0
+    found = load("o.yaml").parameters
+    assert (found["C"].value, found["G"].value) == pytest.approx((6, 0.08), rel=1e-3)
+    assert found["heat"].values == {"run_3": 3, "run_1": 1}
 
 
 def read_as(folder, header, columns, heat="{unit: W, column: P}", time=None):

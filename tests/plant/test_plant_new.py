@@ -117,19 +117,32 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
             "t,T [degC]\n0,1\n1,2\n",
             "no column is recognised as it",
         ),
-        (["--from-csv", "a.csv"], "t,a,b\n0,1,3\n1,2,3\n", "write the units: --outputs 'COLUMN [degC]'"),
+        (["--from-csv", "a.csv"], "t,a,b\n0,1,3\n1,2,3\n", "--outputs 'a [UNIT]'; or take a template"),
+        (["--from-csv", "a.csv"], "t,U [V]\n0,1\n1,2\n", "known in 'U' [V] (voltage); take a template"),
+        (
+            ["--from-csv", "a.csv", "--outputs", "a [g]"],
+            "t,a\n0,1\n1,2\n",
+            "known in 'a' [g]; take a template",
+        ),
+        (["--from-csv", "a.csv", "--outputs", "a [foo]"], "t,a\n0,1\n1,2\n", "'foo' is not a unit"),
+        (
+            ["--from-csv", "a.csv", "--outputs", "force"],
+            "t,force\n0,1\n1,2\n",
+            "known in 'force' [N] (force); write its unit, as [degC] or [m]: --outputs 'force [UNIT]'",
+        ),
         (
             ["--from-csv", "a.csv", "--inputs", "b"],
             "t,T [degC],b\n0,1,3\n1,2,3\n",
             "tells what 'b' is (from 3 to 3)",
         ),
         (["--template", "blok"], "", "did you mean 'block'"),
-        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "recognised as what moves it"),
-        (["--from-csv", "a.csv"], "t,T [degC]\n0,1\n1,2\n", "recognised as what heats it"),
+        (["--from-csv", "a.csv"], "t,x [m],b\n0,1,1\n1,2,2\n", "recognised as what moves it"),
+        (["--from-csv", "a.csv"], "t,T [degC],b\n0,1,1\n1,2,2\n", "'b [W]', or none: --inputs ''"),
+        (["--from-csv", "a.csv"], "t,x [m]\n0,1\n1,2\n", "2 values; 8 or more were expected"),
         (
             ["--from-csv", "a.csv", "--outputs", "P"],
             "t,P [W],T [degC]\n0,1,2\n1,2,2\n",
-            "'P' is no temperature",
+            "none is known in 'P' [W] (power); take a template that is near",
         ),
         (["--from-csv", "a.csv", "--inputs", "Q"], "t,P [W],T [degC]\n0,1,2\n1,2,2\n", "no column 'Q'"),
         (["--from-csv", "a.csv"], "t,P [W],T [degC]\n0,1,2\n1,2,2\n", "2 values; 8 or more were expected"),
@@ -205,7 +218,7 @@ def test_columns_without_units_are_recognised_and_never_a_power(folder, names, c
 def test_a_unit_by_hand_and_a_name_that_says_nothing(folder, capsys):
     heated(folder, ("a", "b", "c"))
     assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 2
-    assert "write the units" in capsys.readouterr().err and not (folder / "p.yaml").exists()
+    assert "write its unit" in capsys.readouterr().err and not (folder / "p.yaml").exists()
     args = ["--inputs", "a [mW], b [degC]", "--outputs", "c [degC]"]
     assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *args]) == 0
     plant = load("p.yaml")
@@ -285,6 +298,82 @@ def test_an_axis_becomes_mass_friction_and_a_spring_if_it_has_one(folder, stiffn
     values = {n: p.value for n, p in plant.parameters.items()}
     assert values["mass"] == pytest.approx(2.0, rel=0.1) and values["damping"] == pytest.approx(6.0, rel=0.1)
     assert values.get("stiffness", 0.0) == pytest.approx(stiffness, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "unit, kind, factor",
+    [
+        *(("deg/s", "rad/s", np.pi / 180), ("°/s", "rad/s", np.pi / 180), ("rpm", "rad/s", np.pi / 30)),
+        *(("mrad/s", "rad/s", 1e-3), ("turn/min", "rad/s", np.pi / 30), ("mrad", "rad", 1e-3)),
+        *(("km/h", "m/s", 1 / 3.6), ("mm/s", "m/s", 1e-3), ("turn", "rad", 2 * np.pi)),
+    ],
+)
+def test_every_unit_of_an_angle_or_a_velocity_is_one(folder, unit, kind, factor):
+    t = np.arange(0.0, 20.0, 0.02)
+    force, x = swung(t, 2.0, 6.0, 0.0)
+    drive = "N*m" if "rad" in kind else "N"
+    moved = x[int("/s" in kind)] / factor
+    rows = "\n".join(f"{a:g},{b:.5f},{c:.8g}" for a, b, c in zip(t, force, moved, strict=True))
+    (folder / "a.csv").write_text(f"t,a,b\n{rows}\n")
+    options = ["--inputs", f"a [{drive}]", "--outputs", f"b [{unit}]"]
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *options]) == 0
+    plant = load("p.yaml")
+    assert plant.outputs["b"].unit == kind
+    size = plant.parameters["inertia" if "rad" in kind else "mass"].value
+    assert (size, plant.parameters["damping"].value) == pytest.approx((2.0, 6.0), rel=0.1)
+
+
+def swing(t):
+    """A mass of 1 on a spring of 40 N/m with 0.3 N*s/m, let go at 0.2 m; its rest is at 0.05 m."""
+    w = (40 - 0.15**2) ** 0.5
+    return 0.05 + 0.15 * np.exp(-0.15 * t) * (np.cos(w * t) + 0.15 / w * np.sin(w * t))
+
+
+FREE = {  # header, options, values over time, and the parameters that made them
+    "swing": ("x [mm]", "", lambda t: 1e3 * swing(t), {"stiffness": 40, "damping": 0.3, "rest": 0.05}),
+    "gyro": (
+        "w [deg/s]",
+        "",
+        lambda t: np.rad2deg(np.gradient(swing(t), t)),
+        {"stiffness": 40, "damping": 0.3},
+    ),
+    "coasting": ("v [km/h]", "", lambda t: 30 * np.exp(-0.05 * t), {"damping": 0.05}),
+    "rolling out": ("x [m]", "", lambda t: 4 * (1 - np.exp(-0.1 * t)), {"damping": 0.1}),
+    "cooling": ("T [degC]", "", lambda t: 21 + 60 * np.exp(-t / 15), {"T_ambient": 21, "G_body_T": 1 / 15}),
+    "warming": ("T [degC]", "", lambda t: 21 - 40 * np.exp(-t / 25), {"T_ambient": 21, "G_body_T": 1 / 25}),
+    "in air": (
+        "T [degC],air [degC]",
+        "",
+        lambda t: (21 + 9 * np.exp(-t / 9), 21 + 0 * t),
+        {"G_body_T": 1 / 9},
+    ),
+    "emptying": ("h [cm]", "h [cm]", lambda t: 100 * (0.7 - 0.01 * t) ** 2, {"outlet_tank_h": 0.02}),
+    "beside": ("x [mm],rh [%]", "x", lambda t: (1e3 * swing(t), 50 + t), {"stiffness": 40, "damping": 0.3}),
+}
+
+
+@pytest.mark.parametrize("kind", FREE)
+def test_a_free_motion_a_cooling_and_an_emptying_need_no_input(folder, kind, capsys):
+    header, outputs, course, truth = FREE[kind]
+    t = np.arange(0.0, 40.0, 0.02)
+    columns = np.atleast_2d(course(t))
+    columns = columns + np.random.default_rng(3).normal(0, 1e-3, columns.shape) * np.ptp(columns[:1])
+    rows = "\n".join(",".join(f"{v:.7g}" for v in row) for row in zip(t, *columns, strict=True))
+    (folder / "a.csv").write_text(f"t,{header}\n{rows}\n")
+    options = ["--outputs", outputs, "--inputs", ""] if outputs else []
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *options]) == 0
+    assert (
+        cli.main(["plant", "check", "p.yaml"])
+        == cli.main(["plant", "check", "p.yaml", "--data", "a.csv"])
+        == 0
+    )
+    plant = load("p.yaml")
+    assert all(i.role == "ambient" for i in plant.inputs.values())
+    assert [p.value for p in plant.parameters.values() if p.range is None] == [1]
+    assert {n: plant.parameters[n].value for n in truth} == pytest.approx(truth, rel=0.1)
+    assert cli.main(["refit", "--plant", "p.yaml", "a.csv", "--out", "o.yaml"]) == 0
+    refitted = load("o.yaml").parameters
+    assert {n: refitted[n].value for n in truth} == pytest.approx(truth, rel=0.01)
 
 
 def test_levels_and_a_pump_become_tanks(folder):

@@ -12,7 +12,9 @@ from thermoctl.checks.data import data_findings
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import label_findings
 from thermoctl.checks.model import plant_findings, start_findings
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant
+from thermoctl.plant.lacking import outputs_lacking
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.plant.units import in_plant_units
 from thermoctl.recording.table import Table
@@ -23,10 +25,12 @@ __all__ = ["Finding", "checks"]
 def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
     """Return what is wrong with a plant and its recordings, severe findings first.
 
-    Raises InputError where a recording lacks an input of the plant."""
+    Raises InputError where a recording lacks an input of the plant, or all its outputs."""
     model = compile_plant(plant)
     tables = [in_plant_units(plant, t) for t in recordings]
     excitations = [model.excitation(t) for t in tables]
+    if text := next(filter(None, (outputs_lacking(plant, t) for t in tables)), ""):
+        raise InputError(text)
     findings = plant_findings(model, excitations)
     for table, excitation in zip(tables, excitations, strict=True):
         findings += data_findings(model, table, excitation)

@@ -12,6 +12,7 @@ from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, commands, load
+from thermoctl.plant.lacking import outputs_lacking
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.foreign.logger import options, print_notes
 from thermoctl.recording.table import Table
@@ -75,11 +76,13 @@ def simulate(args: argparse.Namespace) -> int:
     """`thermoctl simulate`: after the checks, which do not stop it."""
 
     def read(plant: Plant, paths: Sequence[str], args: argparse.Namespace) -> list[Table]:
-        """Read recordings; check those in which an output was measured."""
+        """Read recordings; check those that have a column of an output, say which have none."""
         tables = read_recordings(plant, paths, **options(args))
         print_notes(tables)
-        outputs = [o.column for o in plant.outputs.values()]
-        report(checks(plant, [t for t in tables if any(c in t.columns for c in outputs)]), sys.stderr)
+        lack = [outputs_lacking(plant, t) for t in tables]
+        for text in filter(None, lack):
+            print(f"note: {text}; the simulation is compared with nothing", file=sys.stderr)
+        report(checks(plant, [t for t, text in zip(tables, lack, strict=True) if not text]), sys.stderr)
         return tables
 
     return commands.simulate(args, read)

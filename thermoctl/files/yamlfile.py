@@ -91,8 +91,15 @@ class Node:
 
 def suggest(name: str, allowed: Iterable[str]) -> str:
     """Return ' (did you mean X?)' if an allowed name is close to `name`, else ''."""
-    near = difflib.get_close_matches(str(name), list(allowed), n=1, cutoff=0.6)
-    return f" (did you mean '{near[0]}'?)" if near else ""
+    found = near(name, allowed)
+    return f" (did you mean '{found}'?)" if found else ""
+
+
+def near(name: str, allowed: Iterable[str]) -> str | None:
+    """Return the allowed name that is close to `name` in any case, if there is one."""
+    folded = {str(a).casefold(): a for a in allowed}
+    found = difflib.get_close_matches(str(name).casefold(), folded, n=1, cutoff=0.6)
+    return folded[found[0]] if found else None
 
 
 def load(path: str | Path) -> Node:

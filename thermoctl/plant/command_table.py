@@ -20,7 +20,7 @@ TABLE: Table = {
             argument(
                 "--inputs",
                 metavar="A,B",
-                help="columns of inputs, with units where the file has none: 'P [W],air [degC]' (default: by kind)",
+                help="columns of inputs, with units where the file has none: 'P [W],air [degC]'; '' for none (default: by kind)",
             ),
             argument(
                 "--outputs", metavar="A,B", help="columns of sensors, in the same way (default: by kind)"

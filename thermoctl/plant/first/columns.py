@@ -79,6 +79,7 @@ _WORDS = {
     "duty": "duty pwm pct",
     "power": "p q pel moc power",
 }
+_ANGLES = "rad mrad urad deg degree degrees ° arcmin arcsec turn turns revolution rpm rps"
 _SHARES = {1.0: "1", 100.0: "%"}  # ends of a duty's scale, and the unit
 _AIR = (  # names of surroundings, the outermost first: the room of a building is a body, the weather is not
     "outside outdoor outdoors exterior extern esterno esterna externo externa exterieur exterieure dehors aussen "
@@ -229,12 +230,13 @@ def _kind_of_unit(unit: str, by_name: str) -> str:
         wanted = dimension({"C": "degC", "F": "degF"}.get(unit, unit))
     except ValueError:
         return ""
-    if unit in ("deg", "°", "rad", "degree"):
-        return "angle"
+    symbol = re.match(r"[^\W\d_]+|°", unit)
+    if symbol and symbol[0] in _ANGLES.split() and wanted in (dimension("1"), dimension("Hz")):
+        return "turning" if wanted else "angle"
     if not wanted:
         return "duty" if by_name in ("duty", "power", "flow") else ""
     if wanted == dimension("Hz"):
-        return "turning" if unit in ("rpm", "1/min", "U/min", "rad/s") or by_name == "velocity" else ""
+        return "turning" if unit == "1/min" or by_name == "velocity" else ""
     if wanted == dimension("m"):
         return "level" if by_name == "level" else "position"
     if wanted == _ENERGY:

@@ -15,6 +15,7 @@ from thermoctl.plant.first.template import TEMPLATES
 from thermoctl.recording.foreign.logger import options, print_notes, read_recording
 from thermoctl.recording.foreign.units import column_of, split_unit
 from thermoctl.recording.table import Table
+from thermoctl.units import dimension
 
 HEATING = ("power", "current", "voltage", "duty")
 DRIVING = ("force", "torque", "current", "voltage", "duty", "power")
@@ -125,6 +126,10 @@ def _named(table: Table, text: str | None) -> dict[str, str] | None:
         name, unit = (part, None) if part in table.columns else split_unit(part)
         if name not in table.columns:
             raise _no_column(table, name)
+        try:
+            dimension(unit or "1")
+        except ValueError as e:
+            raise InputError(f"{table.path}: column '{name}': {e}") from None
         units[name] = unit or ""
     return units
 
@@ -141,11 +146,7 @@ def _outputs(
         outputs = [c for c in columns.values() if c.kind in kinds and c.name not in (inputs or ())]
         if outputs:
             return outputs
-        raise InputError(
-            f"{table.path}: no column is recognised as a temperature, position, velocity or level (columns "
-            f"{', '.join(table.columns)}); write the units: --outputs 'COLUMN [degC]' --inputs 'COLUMN [W]', or use a "
-            f"template: {', '.join(TEMPLATES)}"
-        )
+        raise _no_output(table, list(columns.values()))
     outputs = []
     for name in named:
         c = columns[name]
@@ -153,22 +154,36 @@ def _outputs(
             values = table.columns[name]
             low, high = float(values.min()), float(values.max())
             if not COLDEST <= low <= high <= HOTTEST:
-                raise _unclear(table, c, "--outputs", "degC")
+                raise _unclear(table, c, "--outputs", "as [m] or [m/s]")
             c = Column(name, "temperature", "degC", f"'{name}' has no unit; degC by its values")
         if c.kind not in kinds:
-            raise InputError(
-                f"{table.path}: column '{name}' is no temperature, position, velocity or level: it is taken as "
-                f"{c.kind or 'nothing known'}{f' [{c.unit}]' if c.unit else ''}; write its unit: --outputs '{name} [degC]'"
-            )
+            raise _no_output(table, [c])
         outputs.append(c)
     return outputs
 
 
-def _unclear(table: Table, c: Column, option: str, unit: str) -> InputError:
+def _no_output(table: Table, columns: Sequence[Column]) -> InputError:
+    """Return the error that no first plant starts from these columns: asks for a unit where one lacks."""
+    shown = ", ".join(f"'{c.name}'{_taken(c)}" for c in columns)
+    bare = next((c.name for c in columns if not c.unit or c.doubt), None)
+    unit = f"write its unit, as [degC] or [m]: --outputs '{bare} [UNIT]'; or " if bare else ""
+    return InputError(
+        f"{table.path}: a first plant is drawn from a temperature, position, velocity or level, and none is known in "
+        f"{shown}; {unit}take a template that is near, and edit it: thermoctl plant new FILE --template NAME "
+        f"({', '.join(TEMPLATES)})"
+    )
+
+
+def _taken(c: Column) -> str:
+    """Return the unit and the kind of a column as text, such as ' [V] (voltage)'."""
+    return f" [{c.unit}]" * bool(c.unit) + f" ({c.kind})" * bool(c.kind)
+
+
+def _unclear(table: Table, c: Column, option: str, units: str) -> InputError:
     values = table.columns[c.name]
     return InputError(
         f"{table.path}: neither name nor unit tells what '{c.name}' is (from {values.min():.4g} to {values.max():.4g}); "
-        f"write its unit: {option} '{c.name} [{unit}]'"
+        f"write its unit, {units}: {option} '{c.name} [UNIT]'"
     )
 
 
@@ -196,7 +211,9 @@ def _inputs(
     sensors: Sequence[Column],
     does: str,
 ) -> list[Column]:
-    """Return the inputs, by `named`, else by kind. Raises InputError for none or a wrong kind."""
+    """Return the inputs, by `named`, else by kind; none where only sensors are recorded or `named` is empty.
+
+    Raises InputError for a wrong kind, and where an unknown column may be the input."""
     if named is None:
         drives = [
             c for c in columns.values() if c.kind in kinds and c.kind != "temperature" and c not in sensors
@@ -205,17 +222,16 @@ def _inputs(
         drives = [columns[n] for n in named]
         for c in drives:
             if c.kind == "" and not c.unit:
-                raise _unclear(table, c, "--inputs", "W")
+                raise _unclear(table, c, "--inputs", "as [W] or [N]")
             if c.kind not in kinds:
                 raise InputError(
-                    f"{table.path}: column '{c.name}' is taken as {c.kind or 'nothing known'}"
-                    f"{f' [{c.unit}]' if c.unit else ''}; one of {', '.join(kinds)} was expected as an input"
+                    f"{table.path}: input '{c.name}'{_taken(c)}: one of {', '.join(kinds)} was expected"
                 )
-    if not [c for c in drives if c.kind != "temperature"]:
-        rest = [c.name for c in columns.values() if c not in sensors and c.kind != "temperature"]
+    rest = [c.name for c in columns.values() if c not in sensors and c.kind != "temperature"]
+    if named is None and rest and not drives:
         raise InputError(
             f"{table.path}: no column is recognised as what {does} it: {', '.join(k for k in kinds if k != 'temperature')}"
-            f"; name one with its unit, such as --inputs '{rest[0] if rest else 'COLUMN'} [{'W' if does == 'heats' else 'N'}]'"
-            f" (columns {', '.join(table.columns)}), or use a template: {', '.join(TEMPLATES)}"
+            f"; name one with its unit, such as --inputs '{rest[0]} [{'W' if does == 'heats' else 'N'}]', or none: "
+            f"--inputs '' (columns {', '.join(table.columns)}), or use a template: {', '.join(TEMPLATES)}"
         )
     return drives

@@ -3,6 +3,8 @@
 The balance of the volume gives the sizes:
 
     integral of the inflow = A sum (h - h_0) + k integral of sqrt(h_last)
+
+Without a recorded inflow they give k / A: the first area is held at 1.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from thermoctl.plant.first.columns import UNITS, Column, identifiers, noise
-from thermoctl.plant.first.thermal import MARGIN, UNKNOWN_SCALE, confirm, parameter, unknown
+from thermoctl.plant.first.thermal import MARGIN, UNKNOWN_SCALE, confirm, held, parameter, unknown
 from thermoctl.recording.table import Table
 
 
@@ -21,11 +23,11 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     ids = identifiers([c.name for c in (*drives, *sensors)])
     levels = [c.values(table) for c in sensors]
     has_flow = all(d.kind == "flow" and d.unit for d in drives)
-    inflow = np.sum([d.values(table) for d in drives], axis=0)
+    inflow = np.sum([d.values(table) for d in drives], axis=0) if drives else None
     area, outlet = _sizes(table.t, inflow, levels)
     margin = MARGIN * (1.0 if has_flow else UNKNOWN_SCALE)
     lines = [
-        "inputs:",
+        *(["inputs:"] if drives else []),
         *(f"  {ids[d.name]}: {{{d.keys(ids[d.name])}}}{confirm(d.doubt)}" for d in drives),
         "parameters:",
     ]
@@ -41,7 +43,12 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
                 )
             )
     tanks = [f"tank_{ids[c.name]}" for c in sensors]
-    lines += [parameter(f"area_{n}", area, "m^2", margin) for n in tanks]
+    lines += [
+        parameter(f"area_{n}", area, "m^2", margin * (1.0 if drives else MARGIN))
+        if drives or k
+        else held(f"area_{n}", "m^2")
+        for k, n in enumerate(tanks)
+    ]
     lines += [parameter(f"outlet_{n}", outlet, "m^2.5/s", margin * MARGIN) for n in tanks]
     lines.append("nodes:")
     for c, n, h in zip(sensors, tanks, levels, strict=True):
@@ -70,8 +77,10 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     return lines
 
 
-def _sizes(t: np.ndarray, inflow: np.ndarray, levels: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Return a tank's area, m^2, and its outlet's coefficient, m^2.5/s, from the balance of the volume."""
+def _sizes(t: np.ndarray, inflow: np.ndarray | None, levels: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return a tank's area, m^2, and its outlet's coefficient, m^2.5/s, from the balance of the volume.
+
+    Without an inflow the area is 1."""
     dt = np.diff(t)
 
     def integral(values: np.ndarray) -> np.ndarray:
@@ -80,6 +89,8 @@ def _sizes(t: np.ndarray, inflow: np.ndarray, levels: Sequence[np.ndarray]) -> t
 
     stored = np.sum([h - h[0] for h in levels], axis=0)
     lost = integral(np.sqrt(np.maximum(levels[-1], 0.0)))
+    if inflow is None:
+        return 1.0, max(-float(np.sum(stored * lost) / max(float(np.sum(lost**2)), 1e-12)), 1e-9)
     volume = integral(inflow)
     area, outlet = map(float, np.linalg.lstsq(np.column_stack([stored, lost]), volume, rcond=None)[0])
     if not area > 0:

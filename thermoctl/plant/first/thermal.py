@@ -4,8 +4,9 @@ Heat balances the sum of all bodies,
 
     integral of heat dt = C sum (T - T_start) + G sum integral of (T - T_air) dt,
 
-whose least squares give the size of a body's heat capacity C and of its conductance G to the air. Everything
-else is a guess with a comment in the file: which body is heated, and which bodies touch.
+whose least squares give the size of a body's heat capacity C and of its conductance G to the air. Without a
+recorded heat they give G / C and the temperature of the air: one C is held at 1. Everything else is a guess
+with a comment in the file: which body is heated, and which bodies touch.
 """
 
 from __future__ import annotations
@@ -45,7 +46,11 @@ def draft(table: Table, drives: Sequence[Column], air: Column | None, sensors: S
     readings = {ids[c.name]: c.values(table) for c in sensors}
     heats = [_heat(table, c, ids, drives) for c in drives]
     heats = [h for h in heats if h.rate]
-    around = air.values(table) if air else np.full(len(table), min(v[0] for v in readings.values()))
+    if air:
+        around = air.values(table)
+    else:
+        first = min(v[0] for v in readings.values()) if heats else _end(table.t, list(readings.values()))
+        around = np.full(len(table), first)
     column_of = {c.name: ids[c.name] for c in sensors}
     heated = [_heated(table.t, h, readings, column_of) for h in heats]
     sizes = _sizes_of_bodies(table.t, heats, heated, readings, around)
@@ -53,7 +58,7 @@ def draft(table: Table, drives: Sequence[Column], air: Column | None, sensors: S
     bodies = {s: _body(s, set(ids.values())) for s in readings}
     ambient = ids[air.name] if air else "T_ambient"
     names, links = list(bodies.values()), _links(list(bodies.values()))
-    lines = ["inputs:"]
+    lines = ["inputs:"] if inputs else []
     lines += [f"  {ids[c.name]}: {{{c.keys(ids[c.name])}}}{confirm(c.doubt)}" for c in drives]
     if air:
         lines.append(
@@ -62,13 +67,18 @@ def draft(table: Table, drives: Sequence[Column], air: Column | None, sensors: S
     lines.append("parameters:")
     lines += [h.parameter for h in heats if h.parameter]
     if not air:
+        least, most = (float(f(list(readings.values()))) for f in (np.min, np.max))
+        span = f", range: [{2 * least - most:.4g}, {2 * most - least:.4g}]" if not heats else ""
         lines.append(
-            f"  T_ambient: {{value: {around[0]:.4g}, unit: degC}}  # confirm: temperature of the air"
+            f"  T_ambient: {{value: {around[0]:.4g}, unit: degC{span}}}  # confirm: temperature of the air"
         )
     for sensor, body in bodies.items():
         capacity, conductance = sizes[sensor]
+        free = not heats and body == names[0]
         lines += [
-            parameter(f"C_{body}", capacity, "J/K", margin),
+            held(f"C_{body}", "J/K")
+            if free
+            else parameter(f"C_{body}", capacity, "J/K", margin * (1.0 if heats else MARGIN)),
             parameter(f"G_{body}", conductance, "W/K", margin, ABSENT),
         ]
     typical = float(np.mean([g for _, g in sizes.values()]))
@@ -109,6 +119,11 @@ def parameter(name: str, value: float, unit: str, margin: float = MARGIN, least:
     """Return a parameter's line with its range; `least`: its lower end as a share of the value, if not 0."""
     low, high = value * (least or 1 / margin), value * margin
     return f"  {name}: {{value: {value:.3g}, unit: {unit}, range: [{low:.3g}, {high:.3g}]}}"
+
+
+def held(name: str, unit: str) -> str:
+    """Return the line of a parameter that is 1, because nothing recorded drives the plant."""
+    return f"  {name}: {{value: 1, unit: {unit}}}  # confirm: held at 1; a free run gives only ratios to it"
 
 
 def unknown(name: str, unit: str, what: str) -> str:
@@ -176,23 +191,38 @@ def _sizes_of_bodies(
 def _sizes(
     t: np.ndarray, heats: Sequence[np.ndarray], sensors: Sequence[np.ndarray], air: np.ndarray
 ) -> tuple[float, float]:
-    """Return a body's heat capacity, J/K, and conductance to the air, W/K, from the heat balance."""
+    """Return a body's heat capacity, J/K, and conductance to the air, W/K, from the heat balance.
+
+    Without heats the capacity is 1."""
     dt = np.diff(t)
 
     def integral(values: np.ndarray) -> np.ndarray:
         """Return the integral over time up to each sample (N,); each value holds until the next sample."""
         return np.concatenate([[0.0], np.cumsum(values[:-1] * dt)])
 
-    energy = integral(np.sum(heats, axis=0))
     stored = np.sum([v - v[0] for v in sensors], axis=0)
     lost = np.sum([integral(v - air) for v in sensors], axis=0)
-    capacity, conductance = np.linalg.lstsq(np.column_stack([stored, lost]), energy, rcond=None)[0]
     span = float(t[-1] - t[0])
+    if not heats:
+        conductance = -float(np.sum(stored * lost) / max(float(np.sum(lost**2)), 1e-12))
+        return 1.0, conductance if conductance > 0 else 1 / span
+    energy = integral(np.sum(heats, axis=0))
+    capacity, conductance = np.linalg.lstsq(np.column_stack([stored, lost]), energy, rcond=None)[0]
     if not capacity > 0:
         capacity = max(abs(energy[-1]) / max(float(np.ptp(stored)), 1e-9), 1e-9)
     if not conductance > 0:
         conductance = capacity / span
     return float(capacity), float(conductance)
+
+
+def _end(t: np.ndarray, sensors: Sequence[np.ndarray]) -> float:
+    """Return the temperature to which unheated bodies go: by an exponential, else their last mean."""
+    mean = np.mean(sensors, axis=0)
+    time = t - t[0]
+    area = np.concatenate([[0.0], np.cumsum((mean[1:] + mean[:-1]) / 2 * np.diff(t))])
+    rate, pull = np.linalg.lstsq(np.column_stack([-area, time]), mean - mean[0], rcond=None)[0]
+    end, reach = float(pull / rate) if rate > 0 else np.nan, float(np.ptp(mean))
+    return end if mean.min() - reach <= end <= mean.max() + reach else float(mean[-1])
 
 
 def _heated(t: np.ndarray, heat: _Heat, sensors: Mapping[str, np.ndarray], ids: Mapping[str, str]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant import expression as ex
+from thermoctl.plant.lacking import outputs_lacking
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.ahead import ahead, all_uncertain
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
@@ -65,6 +66,8 @@ def last_state(plant: Plant, table: Table) -> dict[str, float]:
     Raises InputError where it has none, or where the plant cannot be simulated on it."""
     model = compile_plant(all_uncertain(plant), ())
     excitation = model.excitation(table)
+    if text := outputs_lacking(plant, table):
+        raise InputError(text)
     if not np.isfinite(excitation.y).any():
         raise InputError(
             f"{table.path}: has no reading of {', '.join(o.column for o in plant.outputs.values())}; its last state "

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant import expression as ex
+from thermoctl.plant.lacking import lacking
 from thermoctl.plant.language import Plant
 from thermoctl.plant.parts import RESTARTED, direct_outputs
 from thermoctl.plant.simulation.compile import Code, machine_code
@@ -137,13 +138,11 @@ class Model:
         u = np.empty((len(t), len(self.code.inputs)))
         linear = np.zeros(len(self.code.inputs), np.intc)
         first: dict[str, float] = {}
+        if missing := [i for i in self.plant.inputs.values() if i.column not in table.columns]:
+            text = lacking(self.plant, table, "input", missing)
+            raise InputError(f"{text}; a constant input can be a parameter of the plant")
         for j, i in enumerate(self.plant.inputs.values()):
-            column = table.columns.get(i.column)
-            if column is None:
-                raise InputError(
-                    f"{table.path}: no column '{i.column}', which input '{i.name}' of {self.plant.file} reads"
-                    f"{suggest(i.column, table.columns)}; columns are {', '.join(list(table.columns)[:40])}"
-                )
+            column = table.columns[i.column]
             u[:, j] = _filled(t, column, i.linear, f"{table.path}: column '{i.column}' (input '{i.name}')")
             linear[j] = i.linear
             first[i.name] = float(column[np.isfinite(column)][0])
