@@ -157,11 +157,12 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         t = np.full(len(sheet), np.nan)
         t[: len(timer.seconds.t)] = timer.seconds.t
         values: dict[str, np.ndarray] = {}
-        notes = [_clock_note(timer, how), *said]
+        notes = [_clock_note(timer, how), clock.rounding(timer.seconds.t), *said]
         for name in names:
             column = sheet.columns[name]
             if not isinstance(column, np.ndarray) or column.dtype.kind != "f":
-                notes.append(f"another time left out: {_plain(name)}")
+                if name not in timer.others:
+                    notes.append(f"another time left out: {_plain(name)}")
             elif name in final:
                 values[final[name]] = column
         t, values, place = _rows(path, sheet, t, values, len(several) > 1, how, notes)
@@ -174,7 +175,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         units = {final[n]: u for n, u in sheet.units.items() if final.get(n) in values}
         start = timer.seconds.start or sheet.start
         if timer.seconds.start and len(t) and t[0] != 0:
-            start, t = _moved(timer.seconds.start, float(t[0])), t - t[0]
+            start, t = clock.later(timer.seconds.start, float(t[0])), t - t[0]
         meta = sheet.meta | ({"start": start} if start else {})
         tables.append(
             Table(path.stem, str(path), t, values, meta, units, tuple(filter(None, notes)), recorded=True)
@@ -198,12 +199,6 @@ def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
 def _plain_time(name: str) -> bool:
     """Return whether a name is a time and nothing else, such as `t`, `Time` or `Zeit`."""
     return axis.named(name) > 0 and len(axis.tokens(name)) == 1
-
-
-def _moved(start: str, seconds: float) -> str:
-    """Return a date some seconds later."""
-    later = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
-    return f"{later}Z" if start.endswith("Z") else str(later)
 
 
 def _plain(name: str) -> str:
@@ -245,7 +240,7 @@ def _clock_note(timer: Clock, how: How) -> str:
     plain = timer.columns == ("t",) or timer.columns == ("t_s",)
     if how.time is not None or not timer.why or (plain and timer.seconds.kind in ("unit", "bare")):
         return "" if timer.seconds.kind in ("unit", "bare") and not how.time else timer.seconds.note
-    return timer.note + " (another: --time COLUMN)"
+    return timer.note
 
 
 def _trace(how: How, timer: Clock, table: Table) -> None:
