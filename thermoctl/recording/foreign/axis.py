@@ -365,7 +365,7 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
 
 
 def _fraction(sheet: Sheet, name: str, t: np.ndarray) -> tuple[np.ndarray, str] | None:
-    """Return the fraction of a second (N,) that a column adds to whole seconds t (N,), and its unit; else None.
+    """Return what a column adds to whole seconds t (N,), in seconds (N,), and its unit; None for nothing.
 
     Its name says milliseconds; or it makes uneven times more even, as milli-, micro- or nanoseconds."""
     values = sheet.columns[name]

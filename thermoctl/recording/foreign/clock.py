@@ -108,7 +108,7 @@ def later(start: str, seconds: float) -> str:
 
 
 def grain(t: np.ndarray) -> float:
-    """Return the largest of 60, 1, 0.1, 0.01 ... s of which all times (N,) are multiples, counted from the first."""
+    """Return the largest of 60, 1, 0.1, 0.01 ... s that divides all times (N,), counted from the first."""
     t = t[np.isfinite(t)]
     since = t - t[:1]
     sizes = (60.0, *(10.0**-k for k in range(7)))

@@ -207,10 +207,12 @@ def _plain(name: str) -> str:
 
 
 def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Return the names in the table of the used columns, and notes: a doubled name gets a number, a missing one its place.
+    """Return the names in the table of the used columns, and notes.
 
-    Left out are an index without a name, and empty columns whose name is missing or doubled. Raises InputError for
-    a second time of one name."""
+    A doubled name gets a number, a missing one its place.
+
+    Left out are an index without a name, and empty columns whose name is missing or doubled.
+    Raises InputError for a second time of one name."""
     every = list(sheet.columns)
     alike: dict[str, list[str]] = {}
     for name in used:
@@ -221,7 +223,7 @@ def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[st
     final: dict[str, str] = {}
     notes = []
     for plain, names in alike.items():
-        another_time = "\0" in names[-1] and axis.named(plain) > 0  # of which columns, nobody knows
+        another_time = "\0" in names[-1] and axis.named(plain) > 0  # nobody knows which columns it times
         if len(names) == 1 and plain and not another_time:
             final[names[0]] = plain
             continue
