@@ -125,7 +125,8 @@ def test_two_clocks_are_two_tables(tmp_path):
     assert list(found.columns) == ["CH1", "CH2"]
 
 
-STEADY = 1366403088.076 + 1.05 * np.arange(40)  # a logger that takes 1.05 s a row
+STEADY = 1366403088.076 + 1.05 * np.arange(200)  # a logger that takes 1.05 s a row
+STEADY[150:] += 3  # and stops once
 
 
 def stamped(seconds):
@@ -151,7 +152,7 @@ def test_the_finest_of_the_times_is_taken(tmp_path, rows):
 
 def test_a_signal_is_no_millisecond_and_rounded_times_are_named(tmp_path):
     pwm = np.random.default_rng(1).integers(0, 1000, 40)
-    rows = [f"{d},{p},20" for d, p in zip(stamped(STEADY), pwm, strict=True)]
+    rows = [f"{d},{p},20" for d, p in zip(stamped(STEADY[:40]), pwm, strict=True)]
     found = read(tmp_path, table("time,pwm,T", *rows))
     np.testing.assert_array_equal(found.columns["pwm"], pwm)
     assert "the times are whole multiples of 1 s and 1 or 2 s apart: rounded?" in found.notes
