@@ -7,7 +7,8 @@ import pytest
 
 from thermoctl import cli
 from thermoctl.cli.commands import COMMANDS
-from thermoctl.command import PURPOSES
+from thermoctl.command import FORMATS, PURPOSES
+from thermoctl.recording.foreign.opening import _SUFFIXES
 
 
 def refused(capsys, *words):
@@ -66,6 +67,18 @@ def test_what_resembles_no_command_gets_no_guess(capsys):
 def test_a_mistake_shows_the_usage_of_its_own_command(words, usage, says, capsys):
     error = refused(capsys, *words.split())
     assert error.startswith(usage) and says in error
+
+
+def test_every_command_lists_the_same_formats():
+    listed = {row.name for row in COMMANDS for a in row.arguments if FORMATS in str(a.options.get("help"))}
+    assert listed >= {"plant check", "simulate", "refit", "diagnose", "noise", "recordings import"}
+    kinds = {_SUFFIXES[s] for s in FORMATS.replace(",", "").split() if s in _SUFFIXES}
+    assert kinds == set(_SUFFIXES.values())
+
+
+def test_diagnose_names_a_plant_that_is_given_as_a_recording(capsys):
+    assert cli.main(["diagnose", "plant.yaml", "run_1.csv", "--out", "out"]) == 2
+    assert "--plant FILE is missing (--plant plant.yaml was meant?)" in capsys.readouterr().err
 
 
 def test_the_command_line_alone_loads_no_package():

@@ -70,12 +70,9 @@ MAP = argument(
     metavar="FILE",
     help="with an FMU as the plant: columns, roles, units, noise and ranges of its variables",
 )
-RECORDINGS = argument(
-    "recordings",
-    nargs="+",
-    metavar="REC",
-    help="recordings (.csv, .txt, .xlsx, .parquet, .arrow, .mf4, .tdms)",
-)
+FORMATS = "text of any dialect, .xlsx, .mat, .mf4, .tdms, .json, .parquet, .arrow"
+"""The formats of recordings that every command reads, for help texts."""
+RECORDINGS = argument("recordings", nargs="+", metavar="REC", help=f"recordings ({FORMATS})")
 TIME = argument(
     "--time",
     metavar="COLUMN|STEP",

@@ -57,6 +57,12 @@ def test_a_whole_recording_is_one_part():
     assert in_parts(plant, table) == [table]
 
 
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_gap_after_the_first_rows(rows):
+    parts = in_parts(loads(WIDE_BLOCK, "plant.yaml"), run(missing=(2 * rows, 60)))
+    assert "inputs may have changed meanwhile" in " ".join(parts[-1].notes) and len(parts[-1]) == 570
+
+
 def test_an_unknown_state_after_a_gap_leaves_the_rest_out():
     plant = loads(
         WIDE_BLOCK.replace(", initial_sigma: 0.5", "").replace("value: one,", "value: 2 * one,"), "plant.yaml"

@@ -125,6 +125,53 @@ def test_two_clocks_are_two_tables(tmp_path):
     assert list(found.columns) == ["CH1", "CH2"]
 
 
+STEADY = 1366403088.076 + 1.05 * np.arange(200)  # a logger that takes 1.05 s a row
+STEADY[150:] += 3  # and stops once
+
+
+def stamped(seconds):
+    return [str(np.datetime64(int(s), "s")).replace("T", " ") for s in seconds]
+
+
+FINE = {
+    "the comma of Python's logging": [f"{d},{1e3 * (s % 1):03.0f},20" for d, s in zip(stamped(STEADY), STEADY, strict=True)],
+    "nanoseconds": ["secs,nsecs,T", *(f"{int(s)},{round(1e9 * (s % 1))},20" for s in STEADY)],
+    "dates, and seconds since the start": ["Time,PWM,Elapsed (s)", *(f"{d},{k % 7},{s - STEADY[0]:.3f}" for k, (d, s) in enumerate(zip(stamped(STEADY), STEADY, strict=True)))],
+    "minutes, and seconds since the start": ["Elapsed (s),Date,T", *(f"{s - STEADY[0]:.3f},{d[:-3]},20" for d, s in zip(stamped(STEADY), STEADY, strict=True))],
+    "dates, and a Unix time": [f"{d},{s:.6f},20" for d, s in zip(stamped(STEADY), STEADY, strict=True)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", FINE.values(), ids=FINE)
+def test_the_finest_of_the_times_is_taken(tmp_path, rows):
+    found = read(tmp_path, "\n".join(rows))
+    np.testing.assert_allclose(found.t - found.t[0], STEADY - STEADY[0], atol=2e-3)
+    assert rows[0].startswith("Elapsed") or found.meta["start"].startswith("2013-04-19T20:24:48")
+    assert not any("rounded?" in n for n in found.notes) and sum("time from" in n for n in found.notes) == 1
+
+
+def test_a_signal_is_no_millisecond_and_rounded_times_are_named(tmp_path):
+    pwm = np.random.default_rng(1).integers(0, 1000, 40)
+    rows = [f"{d},{p},20" for d, p in zip(stamped(STEADY[:40]), pwm, strict=True)]
+    found = read(tmp_path, table("time,pwm,T", *rows))
+    np.testing.assert_array_equal(found.columns["pwm"], pwm)
+    assert "the times are whole multiples of 1 s and 1 or 2 s apart: rounded?" in found.notes
+
+
+def test_several_times_are_one_note(tmp_path):
+    rows = [
+        f"{k % 3} {20 + k % 2} {1394206372724 + 500 * k + 7 * (k % 2)} {1394206486548 + 499 * k} {k / 10}"
+        for k in range(9)
+    ]
+    found = read(tmp_path, "\n".join(rows))
+    (note,) = (n for n in found.notes if "time from" in n)
+    assert (
+        len(found) == 9 and "'column_3'" in note and "'column_4'" in note and "other times: 'column_" in note
+    )
+    chosen = read(tmp_path, "\n".join(rows), time="column_3")
+    np.testing.assert_allclose(chosen.t[:3], [0, 0.507, 1])
+
+
 CELLS = {
     "on and off": (("OFF", "OFF", "ON"), [0, 0, 1]),
     "true and false": (("False", "True", "false"), [0, 1, 0]),

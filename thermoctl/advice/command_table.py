@@ -5,6 +5,7 @@ from __future__ import annotations
 from thermoctl.command import (
     DIAGNOSE,
     EFFECTS,
+    FORMATS,
     JSON,
     MAP,
     MODEL,
@@ -29,7 +30,7 @@ TABLE: Table = {
                 "--data",
                 nargs="+",
                 metavar="REC",
-                help="recordings to check with the plant; exit 1 on a severe fault",
+                help=f"recordings to check with the plant ({FORMATS}); exit 1 on a severe fault",
             ),
             *READING,
         ),

@@ -6,6 +6,7 @@ from thermoctl.command import (
     CONFIG,
     DIAGNOSE,
     EFFECTS,
+    FORMATS,
     HELP,
     MAP,
     READING,
@@ -71,7 +72,7 @@ TABLE: Table = {
                 "recordings",
                 nargs="*",
                 metavar="REC",
-                help="recordings (.csv, .xlsx, .parquet, .arrow) or patterns of them ('runs/*.csv'), or folders of many rigs' "
+                help=f"recordings ({FORMATS}) or patterns of them ('runs/*.csv'), or folders of many rigs' "
                 "recordings: one diagnosis a rig",
             ),
             argument(

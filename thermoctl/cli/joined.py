@@ -78,7 +78,11 @@ def diagnose(args: argparse.Namespace) -> int:
         return explained(args.explain, args.why)
     for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
         if not value:
-            raise InputError(f"diagnose: {option} is missing; --plant, --out and recordings were expected")
+            plant = None if args.plant else next((r for r in args.recordings if r.endswith(".yaml")), None)
+            meant = f" (--plant {plant} was meant?)" if plant else ""
+            raise InputError(
+                f"diagnose: {option} is missing{meant}; --plant, --out and recordings were expected"
+            )
     if args.live:
         from thermoctl.fleet.commands import live_recordings
 

@@ -123,9 +123,9 @@ def _goes_on(plant: Plant, table: Table, k: int) -> bool:
     for o in plant.outputs.values():
         y = table.columns.get(o.column, np.zeros(0))
         near = y[max(k - 2 * FEW, 0) : k + 1 + 2 * FEW]
-        if len(near) < 2 * FEW or not np.isfinite(near).all():
-            continue
         before = y[max(k - 2 * FEW, 0) : k + 1]
+        if len(before) < FEW or len(near) < 2 * FEW or not np.isfinite(near).all():
+            continue
         steps = np.abs(np.diff(before))
         slope = float(np.polyfit(np.arange(len(before)), before, 1)[0])
         noise = max(

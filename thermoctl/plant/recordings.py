@@ -35,7 +35,7 @@ def read_recordings(
 
 
 def _by_column(plant: Plant, columns: Mapping[str, str]) -> dict[str, str]:
-    """Return `columns` with the column that the plant reads as key, in place of an input's or output's name."""
+    """Return `columns` with the plant's column as key in place of the name of an input or output."""
     read = {r.column: r.column for r in plant.readings()}
     own = {r.name: r.column for r in plant.readings()} | read
     chosen: dict[str, str] = {}

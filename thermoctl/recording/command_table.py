@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import JSON, LOOK, READING, Table, argument, command
+from thermoctl.command import FORMATS, JSON, LOOK, READING, Table, argument, command
 
 TABLE: Table = {
     LOOK: (
@@ -40,12 +40,7 @@ TABLE: Table = {
             "read the files of any logger and write Parquet with units; several files are parts of one recording",
             "thermoctl.recording.commands:import_recordings",
             "",
-            argument(
-                "files",
-                nargs="+",
-                metavar="FILE",
-                help="text of any dialect, .xlsx, .mf4, .tdms, .mat, .json, .parquet",
-            ),
+            argument("files", nargs="+", metavar="FILE", help=FORMATS),
             argument("--out", metavar="OUT", help="OUT.parquet (or .csv, .arrow: without units)"),
             argument("--explain", action="store_true", help="say how each file is read, and why"),
             *READING,

@@ -101,6 +101,31 @@ class Seconds:
     kind: str = "bare"
 
 
+def later(start: str, seconds: float) -> str:
+    """Return a date some seconds later."""
+    date = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
+    return f"{date}Z" if start.endswith("Z") else str(date)
+
+
+def grain(t: np.ndarray) -> float:
+    """Return the largest of 60, 1, 0.1, 0.01 ... s that divides all times (N,), counted from the first."""
+    t = t[np.isfinite(t)]
+    since = t - t[:1]
+    sizes = (60.0, *(10.0**-k for k in range(7)))
+    return next((g for g in sizes if np.all(np.abs(since / g - np.round(since / g)) < 1e-3)), 0.0)  # noqa: PLR2004
+
+
+def rounding(t: np.ndarray) -> str:
+    """Return a note where the steps of the times (N,) differ as rounding makes even ones differ."""
+    steps = np.diff(t[np.isfinite(t)])
+    if len(steps) < 2 or not 0 < np.ptp(steps) <= 1.001 * np.median(steps):  # noqa: PLR2004
+        return ""
+    size = grain(t)
+    if abs(np.ptp(steps) - size) > 0.001 * size:  # noqa: PLR2004
+        return ""
+    return f"the times are whole multiples of {size:g} s and {steps.min():g} or {steps.max():g} s apart: rounded?"
+
+
 def tidied(texts: pa.Array) -> pa.Array:
     """Return times in the one spelling that `from_texts` reads."""
     texts = pc.utf8_trim(texts, characters=" \t\"'\u00a0")

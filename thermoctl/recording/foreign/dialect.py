@@ -377,7 +377,7 @@ def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Return names that differ: an index without a name is one blank; a name used before gets \\0 and its place."""
+    """Return names that differ: a repeated or missing one gets \\0 and its place, the first a blank."""
     if not names[0]:
         names = [" ", *names[1:]]
     return [name if name and name not in names[:i] else f"{name}\0{i}" for i, name in enumerate(names)]

@@ -275,7 +275,7 @@ def _of_matrices(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
 
 
 def _stated(fields: Mapping[str, Any]) -> float | None:
-    """Return the sampling interval, s, that a number called Ts, dt, Fs or sample time states, if there is one."""
+    """Return the sampling interval, s, by a number called Ts, dt, Fs or sample time; None without one."""
     names = {"ts": "interval", "fs": "samplerate"}
     numbers = {
         n.lower(): v for n, v in fields.items() if np.size(v) == 1 and np.asarray(v).dtype.kind in "fiu"

@@ -157,11 +157,12 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         t = np.full(len(sheet), np.nan)
         t[: len(timer.seconds.t)] = timer.seconds.t
         values: dict[str, np.ndarray] = {}
-        notes = [_clock_note(timer, how), *said]
+        notes = [_clock_note(timer, how), clock.rounding(timer.seconds.t), *said]
         for name in names:
             column = sheet.columns[name]
             if not isinstance(column, np.ndarray) or column.dtype.kind != "f":
-                notes.append(f"another time left out: {_plain(name)}")
+                if name not in timer.others:
+                    notes.append(f"another time left out: {_plain(name)}")
             elif name in final:
                 values[final[name]] = column
         t, values, place = _rows(path, sheet, t, values, len(several) > 1, how, notes)
@@ -174,7 +175,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
         units = {final[n]: u for n, u in sheet.units.items() if final.get(n) in values}
         start = timer.seconds.start or sheet.start
         if timer.seconds.start and len(t) and t[0] != 0:
-            start, t = _moved(timer.seconds.start, float(t[0])), t - t[0]
+            start, t = clock.later(timer.seconds.start, float(t[0])), t - t[0]
         meta = sheet.meta | ({"start": start} if start else {})
         tables.append(
             Table(path.stem, str(path), t, values, meta, units, tuple(filter(None, notes)), recorded=True)
@@ -200,22 +201,18 @@ def _plain_time(name: str) -> bool:
     return axis.named(name) > 0 and len(axis.tokens(name)) == 1
 
 
-def _moved(start: str, seconds: float) -> str:
-    """Return a date some seconds later."""
-    later = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
-    return f"{later}Z" if start.endswith("Z") else str(later)
-
-
 def _plain(name: str) -> str:
     """Return the name of a column as the header has it; several columns can have it."""
     return name.partition("\0")[0].strip()
 
 
 def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Return the names in the table of the used columns, and notes: a doubled name gets a number, a missing one its place.
+    """Return the names in the table of the used columns, and notes.
 
-    Left out are an index without a name, and empty columns whose name is missing or doubled. Raises InputError for
-    a second time of one name."""
+    A doubled name gets a number, a missing one its place.
+
+    Left out are an index without a name, and empty columns whose name is missing or doubled.
+    Raises InputError for a second time of one name."""
     every = list(sheet.columns)
     alike: dict[str, list[str]] = {}
     for name in used:
@@ -226,7 +223,7 @@ def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[st
     final: dict[str, str] = {}
     notes = []
     for plain, names in alike.items():
-        another_time = "\0" in names[-1] and axis.named(plain) > 0  # of which columns, nobody knows
+        another_time = "\0" in names[-1] and axis.named(plain) > 0  # nobody knows which columns it times
         if len(names) == 1 and plain and not another_time:
             final[names[0]] = plain
             continue
@@ -245,7 +242,7 @@ def _clock_note(timer: Clock, how: How) -> str:
     plain = timer.columns == ("t",) or timer.columns == ("t_s",)
     if how.time is not None or not timer.why or (plain and timer.seconds.kind in ("unit", "bare")):
         return "" if timer.seconds.kind in ("unit", "bare") and not how.time else timer.seconds.note
-    return timer.note + " (another: --time COLUMN)"
+    return timer.note
 
 
 def _trace(how: How, timer: Clock, table: Table) -> None:

@@ -94,7 +94,7 @@ def split_words(header: str) -> tuple[str, str | None]:
 
 
 def column_of(name: str, columns: Container[str], units: Mapping[str, str]) -> str | None:
-    """Return the column of a name, also of one with its unit, as in the file's header; None if there is none."""
+    """Return the column of a name, also of one with its unit as in the file's header; None without one."""
     plain, unit = split_words(name)
     return name if name in columns else plain if plain in columns and unit == units.get(plain) else None
 
