@@ -102,7 +102,7 @@ def test_a_rival_at_the_place_of_the_leading_effect_is_refitted_though_it_promis
     s = Known({})
     vars(s.case.budget).update(fits_done=0, planned=0, untried=0)
     s.best.fitted.log_likelihood = 0.0
-    found = beam.extensions(s, s.best, SimpleNamespace(every=(), metric=None, directions=[], promises=[]))
+    found = beam.extensions(s, s.best, SimpleNamespace(directions=[], promises=[]))
     assert (("lag", where) in {k for w in found for k in w.fitted.hypothesis.keys}) == (where == "here")
 
 

@@ -1,4 +1,4 @@
-"""Two effects of which neither leads alone: they cancel nearly, or one wrong effect imitates both."""
+"""Two effects that cancel each other nearly: neither promises anything alone, both together do."""
 
 from __future__ import annotations
 
@@ -41,37 +41,3 @@ def test_a_split_of_heat_that_a_gain_cancels_is_found_with_it():
     assert max(alone) < score[frozenset()] + 2
     assert found.searched.tried[0].fitted.hypothesis.keys == {SPLIT, GAIN}
     assert found.decision.verdict == "explained" and SPLIT in found.decision.named
-
-
-SWING = """
-format: thermoctl-plant/1
-title: a weight on a spring, let go
-parameters:
-  mass: {value: 1.0, unit: kg}
-  stiffness: {value: 80, unit: N/m, range: [40, 160]}
-  damping: {value: 0.1, unit: N*s/m, range: [1.0e-4, 5]}
-nodes:
-  velocity: {unit: m/s, storage: mass, initial: 0, initial_sigma: 0.3}
-  position: {unit: m, storage: 1, initial: first(reading), initial_sigma: 0.02}
-flows:
-  spring: {from: velocity, rate: stiffness * position, unit: N}
-  damper: {from: velocity, rate: damping * velocity, unit: N}
-  travel: {into: position, rate: velocity, unit: m/s}
-outputs:
-  reading: {value: position, unit: m, noise: 0.003}
-"""
-
-
-def test_a_softening_spring_with_drag_is_refitted_though_a_hysteresis_leads():
-    """The hysteresis alone was 43 nats ahead of the spring alone, so that drag was never tried beside it."""
-    truth = (
-        SWING.replace("initial: first(reading)", "initial: 0.3")
-        .replace("stiffness * position", "stiffness * position - 31 * position**3")
-        .replace("damping * velocity", "damping * velocity + 0.09 * velocity * abs(velocity)")
-    )
-    t = np.arange(1800) * 0.02
-    table = compile_plant(loads(truth)).measure(Table("run", "run.csv", t, {}), seed=3)
-    found = diagnose(loads(SWING), [table], catalogue(), limits())
-    score = {w.fitted.hypothesis.keys: w.score for w in found.searched.tried}
-    pair = frozenset({("cubic_stiffness", "velocity"), ("quadratic_drag", "velocity")})
-    assert score[pair] == max(score.values())

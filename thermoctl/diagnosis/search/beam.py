@@ -23,7 +23,7 @@ from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
-from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, pairs, shortlist, simpler
+from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
@@ -349,7 +349,11 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     out: list[Weighed] = []
     doubtful: list[Weighed] = []
     quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
-    queue, planned, ratio = _queue(s, parent, looked), case.budget.later, 1.0
+    # beside effects that leave only noise, two more would imitate a small misfit
+    misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
+    queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
+    new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
+    queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
@@ -392,18 +396,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
-
-
-def _queue(s: Search, parent: Weighed, looked: Screened) -> list[Extension]:
-    """Return the extensions of a hypothesis that may be refitted, in their order."""
-    case, where, limits = s.case, s.where, s.limits
-    alone = not parent.fitted.hypothesis.effects
-    # beside effects that leave only noise, two more would imitate a small misfit
-    paired = alone or not only_noise(case, parent.fitted, limits)
-    queue = shortlist(looked, where, limits, paired)
-    new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
-    queue += elsewhere(new, s.best.score - parent.score, looked, queue)
-    return queue + (pairs(looked.every, looked.metric, where, limits, rivals=True) if alone else [])
 
 
 def _rival(added: Sequence[Direction], leading: Keys) -> bool:

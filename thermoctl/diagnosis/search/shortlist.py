@@ -130,27 +130,13 @@ def _constant(c: Candidate) -> bool:
 
 
 def pairs(
-    directions: Sequence[Direction],
-    metric: Metric,
-    where: Mapping[str, set[str]],
-    limits: Thresholds,
-    rivals: bool = False,
+    directions: Sequence[Direction], metric: Metric, where: Mapping[str, set[str]], limits: Thresholds
 ) -> list[Extension]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
     The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
-    joint gain has to outweigh their prior odds. With `rivals` the pairs are those that promise more together
-    than each alone, odds taken off. A single effect may imitate them, so that none of the two leads. The
-    foremost effect is in none of them: extended by itself, it finds its partners. Nor is a drift, of which
-    any misfit has a share."""
-    kept = once(
-        d
-        for d in directions
-        if d.vector is not None
-        and d.gain > 0
-        and _constant(d.candidate)
-        and not (rivals and d.candidate.effect.timed)
-    )
+    joint gain has to outweigh their prior odds."""
+    kept = once(d for d in directions if d.vector is not None and d.gain > 0 and _constant(d.candidate))
     if len(kept) < PAIR:
         return []
     v = np.stack([d.vector for d in kept if d.vector is not None]).astype(float)
@@ -158,18 +144,14 @@ def pairs(
     c = np.clip(v @ v.T, -ALIKE, ALIKE)
     # size of the first beside the second, along its unit vector
     first = (g[:, None] - c * g[None]) / (1 - c**2)
+    joint = g[:, None] * first + g[None] * first.T
     own = np.array([odds((Placed(d.candidate, {}),), where, limits) for d in kept])
     alone = np.array([d.gain for d in kept])
-    joint, better = g[:, None] * first + g[None] * first.T, np.maximum.outer(alone, alone)
-    score, scores = 0.5 * alone + own, 0.5 * joint + np.add.outer(own, own)
-    worth, rank = (joint > 2 * better) & (scores > 0), joint - better
-    if rivals:
-        worth, rank = scores > np.maximum(np.maximum.outer(score, score), 0.0), scores
-        worth[np.argmax(score)] = worth[:, np.argmax(score)] = False
-    worth = np.triu(worth, 1)
+    extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
+    worth = (extra > np.maximum.outer(alone, alone)) & (0.5 * joint + np.add.outer(own, own) > 0)
     out: list[Extension] = []
-    for k in np.argsort(np.where(worth, -rank, np.inf), axis=None, kind="stable")[: int(worth.sum())]:
-        a, b = np.unravel_index(k, worth.shape)
+    for k in np.argsort(np.where(worth, -extra, 0.0), axis=None, kind="stable")[: int(worth.sum())]:
+        a, b = np.unravel_index(k, extra.shape)
         pair = (resized(kept[a], first[a, b] / g[a]), resized(kept[b], first[b, a] / g[b]))
         if all(d is not None for d in pair):
             left = metric.residual - first[a, b] * v[a] - first[b, a] * v[b]

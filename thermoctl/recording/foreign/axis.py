@@ -35,13 +35,12 @@ STEP = 50  # points for a column that has the interval stated in the file
 NAMED, COUNTED, FOREIGN = 30, -30, -60
 STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
 NEEDED = 30  # least points of a clock
-SURE = (
-    60  # least points of a clock that is used even if another column holds wrong dates, or named as another
-)
+# Least points of a clock that is used though another column holds wrong dates, or is named as another.
+SURE = 60
 COUNTER = 1.0  # step of a column that counts rows
 _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-# A column without a name is the fraction of whole seconds if it makes the steps' spread EVENER times as large, in
-# ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by chance.
+# A column without a name is the fraction of whole seconds if it makes the steps' spread EVENER times as
+# large, in ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by chance.
 EVENER, ENOUGH = 0.5, 20
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
