@@ -40,8 +40,8 @@ SURE = (
 )
 COUNTER = 1.0  # step of a column that counts rows
 _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-# A column without a name is the fraction of whole seconds if it makes the steps' spread EVENER times as large, in
-# ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by chance.
+# A column without a name is the fraction of whole seconds if it reduces the steps' spread by EVENER.
+# It takes ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do so.
 EVENER, ENOUGH = 0.5, 20
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
