@@ -78,7 +78,8 @@ def test_every_kind_of_data_gives_the_same(plant, frames):
     table = tc.read(minutes, time="clock")
     milliwatts = frame.assign(heat=1000 * frame.heat).rename(columns={"heat": "heat [mW]"})
     expected = tc.simulate(plant, path).outputs["temperature_2"]
-    for data in (frame, {c: frame[c].to_numpy() for c in frame}, indexed, table, milliwatts):
+    renamed = tc.read(milliwatts, columns={"heat": "heat [mW]"})
+    for data in (frame, {c: frame[c].to_numpy() for c in frame}, indexed, table, milliwatts, renamed):
         assert np.allclose(tc.simulate(plant, data).outputs["temperature_2"], expected, atol=1e-9)
 
 

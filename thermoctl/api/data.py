@@ -80,6 +80,7 @@ def _of_frame(
     values, units = {}, {}
     for header, column in arrays.items():
         short, unit = split_unit(header)
+        unit = unit or split_unit((columns or {}).get(header, ""))[1]
         try:
             values[short] = np.asarray(column, float)
         except (TypeError, ValueError):
