@@ -470,7 +470,7 @@ def test_every_entry_of_the_catalogue_reads_and_a_users_own_replaces_it(tmp_path
         ),
         (
             "effect: m\ntitle: T\nwhere: sensor\nsource: s\nchange: [{value: y * G}]\nparameters: {g: {low: 0}}\n",
-            "bad.yaml:5:18: value: 'G' is not known here; allowed are air",
+            "bad.yaml:5:18: value: 'G' is not known here (did you mean 'g'?); allowed are air",
         ),
     ],
 )
