@@ -57,14 +57,6 @@ def test_what_nothing_else_confirms_is_missing_and_has_no_name():
     assert decide(found, Facts(found.something, 0.0, (), 3.0, 1.0), limits()).verdict == "unexplained"
 
 
-def test_findings_with_which_the_plant_follows_the_data_worse_are_none():
-    """A motor's remainder absorbed slow errors; with what it left the free run erred 4.8 times as much."""
-    found = weighed({NOTHING: 0.0, ONE: 40.0})
-    facts = Facts(found.something, found.something, (A,), 3.0, 0.7, grown=4.8)
-    assert decide(found, facts, limits()).verdict == "unexplained"
-    assert decide(found, dataclasses.replace(facts, grown=0.9), limits()).named == (A,)
-
-
 def test_alternatives_hold_the_set_and_no_more():
     found = weighed({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5, frozenset({("back_emf", "v")}): 10.0})
     facts = Facts(found.something, found.something, (), 1.0, 0.3)

@@ -121,7 +121,6 @@ def decided(sought: Sought) -> Diagnosis:
         remains=remains,
         worse=value.worse if checked else 0.0,
         flow=unknown.probability,
-        grown=_ratio(after.over_noise, before.over_noise),
     )
     decision = decide(posterior, facts, numbers)
     diagnosis = Diagnosis(

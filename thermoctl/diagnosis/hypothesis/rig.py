@@ -30,7 +30,7 @@ TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN
 MOVING = ("velocity", "rotation")
 FLOWING = ("volume flow", "mass flow")
 # Kinds by unit of a node that structure makes a velocity, and of its position.
-RATES, PLACES = ("", *MOVING, "voltage"), ("", "length", "voltage")
+RATES, PLACES = ("", *MOVING, *FLOWING, "voltage"), ("", "length", "voltage")
 JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
 # Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
 # has a note about each guess.

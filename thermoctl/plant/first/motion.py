@@ -11,9 +11,11 @@ motion gives only b / m and k / m: the mass is held at 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from thermoctl.plant.first.columns import UNITS, Column, identifiers, noise
 from thermoctl.plant.first.thermal import MARGIN, UNKNOWN_SCALE, confirm, held, parameter, unknown
@@ -119,12 +121,7 @@ def _free(t: np.ndarray, place: np.ndarray | None, speed: np.ndarray | None) -> 
 
     Only a spring turns it back. Then its frequency is that of the largest spectral line; the logarithmic
     decrement from the first half to the second gives the damping. Else least squares give the damping."""
-    time, dt = t - t[0], np.diff(t)
-
-    def integral(values: np.ndarray) -> np.ndarray:
-        """Return the integral over time up to each sample (N,), by trapezoids."""
-        return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * dt)])
-
+    time, integral = t - t[0], partial(cumulative_trapezoid, x=t, initial=0)
     seen = place if place is not None else speed
     assert seen is not None
     x = seen if place is not None else integral(seen)
@@ -146,14 +143,8 @@ def _sizes(
     t: np.ndarray, force: np.ndarray, place: np.ndarray | None, speed: np.ndarray | None
 ) -> tuple[float, float, float]:
     """Return mass, damping and stiffness for the drive as a force; 0 where there is no spring."""
-    dt = np.diff(t)
-
-    def integral(values: np.ndarray) -> np.ndarray:
-        """Return the integral over time up to each sample (N,), by trapezoids."""
-        return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * dt)])
-
-    held = np.concatenate([[0.0], np.cumsum(force[:-1] * dt)])
-    time = t - t[0]
+    time, integral = t - t[0], partial(cumulative_trapezoid, x=t, initial=0)
+    held = np.concatenate([[0.0], np.cumsum(force[:-1] * np.diff(t))])
     if speed is not None:
         x = place if place is not None else integral(speed)
         plain, target = [speed - speed[0], integral(speed)], held

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from thermoctl.plant.first.columns import Column, identifiers, noise, words
 from thermoctl.recording.table import Table
@@ -219,7 +220,7 @@ def _end(t: np.ndarray, sensors: Sequence[np.ndarray]) -> float:
     """Return the temperature to which unheated bodies go: by an exponential, else their last mean."""
     mean = np.mean(sensors, axis=0)
     time = t - t[0]
-    area = np.concatenate([[0.0], np.cumsum((mean[1:] + mean[:-1]) / 2 * np.diff(t))])
+    area = cumulative_trapezoid(mean, t, initial=0)
     rate, pull = np.linalg.lstsq(np.column_stack([-area, time]), mean - mean[0], rcond=None)[0]
     end, reach = float(pull / rate) if rate > 0 else np.nan, float(np.ptp(mean))
     return end if mean.min() - reach <= end <= mean.max() + reach else float(mean[-1])
