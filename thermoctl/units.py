@@ -204,7 +204,10 @@ def _symbol(symbol: str) -> Dimension:
 def _registry() -> Any:
     import pint
 
-    return pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry(on_redefinition="ignore")
+    registry.define("newton_meter = newton * meter = Nm")  # pint's Nm measures yarn
+    registry.define("newton_centimeter = newton_meter / 100 = Ncm")
+    return registry
 
 
 @cache

@@ -7,6 +7,7 @@ import pytest
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.logger import read_recording
+from thermoctl.units import conversion
 
 ISO = "2026-03-01 10:00:0"
 
@@ -314,6 +315,26 @@ def test_a_header_that_lacks_a_name(tmp_path):
     assert any("lacks the first column's name" in n for n in found.notes)
     found = read(tmp_path, table("T,P", *(f"{ISO}{i},2{i},{i}" for i in range(3))))
     assert found.t.tolist() == [0, 1, 2] and found.columns["P"].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "written, unit, factor",
+    [
+        ("Nm", "N*m", 1), ("mNm", "N*m", 1e-3), ("N.m", "N*m", 1), ("Ncm", "N*m", 0.01), ("Nm/A", "N*m/A", 1),
+        ("U/min", "rad/s", np.pi / 30), ("RPM", "rad/s", np.pi / 30), ("rev/s", "rad/s", 2 * np.pi),
+        ("min-1", "Hz", 1 / 60), ("m/s2", "m/s^2", 1), ("W/m2", "W/m^2", 1), ("m3/h", "m^3/s", 1 / 3600),
+        ("LPM", "m^3/s", 1e-3 / 60), ("cfm", "m^3/s", 0.3048**3 / 60), ("Arms", "A", 1), ("VDC", "V", 1), ("KW", "W", 1000),
+        ("%RH", "1", 0.01), ("bar(g)", "Pa", 1e5), ("PSI", "Pa", 6894.757293168), ("mmHg", "Pa", 133.322387),
+    ],
+)  # fmt: skip
+def test_units_as_loggers_write_them(tmp_path, written, unit, factor):
+    """pint takes Nm for a unit of yarn, U/min for one of enzymes, and cfm for a length."""
+    for text in (
+        table(f"time [s],x [{written}]", "0,20", "1,21"),
+        table("time,x", f"s,{written}", "0,20", "1,21"),
+    ):
+        found = read(tmp_path, text)
+        assert conversion(found.units["x"], unit) == (pytest.approx(factor), 0)
 
 
 def test_names_of_parquet_state_units_as_those_of_a_text(tmp_path):

@@ -251,7 +251,10 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
 
 def _bare(cell: str) -> str:
     """Return the unit of a cell such as `[degC]`, `(degC)` or `in degC`."""
-    return re.sub(r"^in\s+", "", cell.strip("[]() "))
+    text = cell.strip()
+    while text[:1] + text[-1:] in ("[]", "()"):
+        text = text[1:-1].strip()
+    return text.removeprefix("in ").strip()
 
 
 def _is_units(cells: list[str], above: list[str]) -> bool:

@@ -17,8 +17,8 @@ WORDS: dict[str, Any] = yaml.load(
 """Words that loggers use, by kind."""
 # Symbols that make `(...)` behind a name a unit; square brackets always hold one.
 _SYMBOL = (
-    r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|rpm|rps|kn|dBm|dB|"
-    r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|eV|Wb|lx|rad|Ah))"
+    r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|mmHg|inHg|lbf|lb|kgf|ft|gallon|rpm|rps|kn|dBm|dB|"
+    r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|Ncm|eV|Wb|lx|rad|Ah))"
 )
 ANGLES = (), dimension("Hz")  # dimensions in which pint takes a radian for 1 and a turn for 2 pi
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
@@ -40,6 +40,9 @@ def spelled(unit: str | None, name: str = "") -> str | None:
     unit = re.sub(r"°\s?C|℃|\bdeg\.? ?C\b", "degC", unit)
     unit = re.sub(r"°\s?F|℉|\bdeg\.? ?F\b", "degF", unit)
     unit = re.sub("Ω|Ω|Ohm", "ohm", unit)
+    if _UNIT.match(unit):  # N.m and m/s2
+        unit = re.sub(r"(?<=[^\W\d_])[.· ](?=[^\W\d_])", "*", unit)
+        unit = re.sub(r"(?<=[^\W\d_])(?=-?\d)", "^", unit)
     return unit if unit not in ("", "-", "–", "--") else None
 
 
