@@ -145,9 +145,8 @@ def ipsid(u: np.ndarray, y: np.ndarray):
 def error(model, u: np.ndarray, truth: np.ndarray) -> float:
     """Free-run rmse of (a, b, c) or a StateSpace."""
     a, b, c = (model.a, model.b, model.c) if hasattr(model, "a") else model
-    y = kernels.simulate(
-        *(np.ascontiguousarray(v, dtype=float) for v in (a, b, c)), np.zeros(len(a)), np.ascontiguousarray(u)
-    )
+    a, b, c, u = (np.ascontiguousarray(v, dtype=float) for v in (a, b, c, u))
+    y = kernels.simulate(a, b, c, np.zeros(len(a)), u)
     with np.errstate(over="ignore", invalid="ignore"):
         e = float(np.sqrt(np.mean((y - truth) ** 2)))
     return e if np.isfinite(e) else np.inf
@@ -384,9 +383,8 @@ def measured_data() -> None:
                     period=period,
                 ):
                     data = (np.vstack([*(o[k] for o in before), v[:stop]]) for k, v in enumerate((u, y)))
-                    return StateSpace(
-                        *(np.asarray(v, float) for v in run(*data, order, i)), period, np.zeros(order)
-                    )
+                    a, b, c = (np.asarray(v, float) for v in run(*data, order, i))
+                    return StateSpace(a, b, c, period, np.zeros(order))
 
                 try:
                     held = left(fit(cut), cut, len(u))

@@ -94,11 +94,12 @@ def smoothed(plant: Plant, tables: Sequence[Table], nodes: Sequence[str]) -> tup
     first = as_refitted(known, fitted(known, known.plant, (), known.null))
     at = tracked(known, first, list(nodes))
     rig = Rig(first.rough_plant, known.drives(first.rough.model), [t.columns for t in known.tables])
+    runs = [{**run, "t": d.t} for run, d in zip(at.metric.signals, at.metric.drives, strict=True)]
     flows = {}
     for node in nodes:
-        found = signals(rig, Place(node), at.runs)
-        x = np.concatenate([values(found, run) for run in at.runs])
-        y = np.concatenate([np.asarray(run[f"{LATENT}{node}"]) for run in at.runs])
+        found = signals(rig, Place(node), runs)
+        x = np.concatenate([values(found, run) for run in runs])
+        y = np.concatenate([np.asarray(run[f"{LATENT}{node}"]) for run in runs])
         keep = np.linspace(0, len(y) - 1, min(MOST, len(y))).astype(int)
         flows[node] = found, x[keep], y[keep]
     return first, flows

@@ -1,7 +1,9 @@
 """Laws of published systems that faults imitate, that are two at once, and that act in chaos."""
 
+import numpy as np
 import pytest
 
+from tests.bench.laws import smoothed
 from tests.bench.published import plant_of
 from tests.laws.published import SYSTEMS
 from thermoctl.diagnosis.diagnose import diagnose
@@ -29,6 +31,16 @@ def test_two_laws_missing_at_once_are_found_at_both_places():
     for node, size in (("rabbits", -0.9), ("wolves", 0.8)):
         q = {k: found.final.plant.parameters[f"{k}1_law_{node}"].value for k in "AZW"}
         assert q["A"] / (q["Z"] * q["W"]) == pytest.approx(size, rel=0.01)
+
+
+def test_the_peers_get_the_flow_that_is_missing():
+    system = next(s for s in SYSTEMS if "one term" in s.name)
+    drawn = system.draw(0)
+    _, flows = smoothed(plant_of(system, drawn), drawn.tables[:-1], list(system.missing))
+    (signals, x, flow), (node, law) = flows["wolves"], next(iter(system.missing.items()))
+    true = law(drawn.truth[0], *system.coefficients[node])
+    assert [str(s.value.value) for s in signals] == ["wolves", "rabbits"] and x.shape == (len(flow), 2)
+    assert np.median(np.abs(flow - true)) < 0.15 * np.ptp(true)
 
 
 @pytest.mark.slow  # a minute

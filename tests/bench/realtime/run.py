@@ -474,8 +474,9 @@ def bench_law(bench: Bench, ticks: int = 20000, repeats: int = 15) -> dict[str, 
     import setuptools
 
     from thermoctl.configuration.settings import load_settings
-    from thermoctl.control.law import COMPILED, OUTPUTS, Law
+    from thermoctl.control.law import COMPILED, Law
     from thermoctl.daemon.tick.assemble import compensator, law_parameters
+    from thermoctl.rig.signals import OUTPUTS
 
     if not COMPILED:
         raise SystemExit("the law is not compiled: make install")
@@ -801,17 +802,17 @@ def report(law: dict, conditions: dict[str, dict]) -> tuple[list[str], int]:
         ),
     ]
     lines += ["", "| figure | measured | bar | met |", "|---|---|---|---|"]
-    for name, measured, bar, met in bars:
+    for name, measured, wanted, met in bars:
         said = (
             "-"
-            if met is None and not bar.startswith("aim")
+            if met is None and not wanted.startswith("aim")
             else "not reached"
             if met is None
             else "yes"
             if met
             else "**no**"
         )
-        lines.append(f"| {name} | {measured} | {bar} | {said} |")
+        lines.append(f"| {name} | {measured} | {wanted} | {said} |")
     return lines, sum(met is False for *_, met in bars)
 
 
