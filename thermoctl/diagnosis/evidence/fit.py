@@ -250,9 +250,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
         left=2 * top.left,
     )
     # with hundreds of recordings, the Hessian with all initial states would fill the memory
-    rough = dataclasses.replace(
-        rough, hessian=kept(rough.hessian, parameters), prior_hessian=np.zeros((0, 0))
-    )
+    rough = dataclasses.replace(rough, hessian=kept(rough.hessian, parameters))
     rough_powers = case.coordinates.powers(posterior.rows(rough.residuals))
     if not problem.keeps:
         maximum, rough = (dataclasses.replace(x, residuals=[], sizes=x.rms()) for x in (maximum, rough))

@@ -32,7 +32,7 @@ class Fit:
     - `values` (recordings, parameters) in the model's order; `dx0` (recordings, uncertain states)
     - `unknowns`: (name, recording index or None) of each free parameter and initial state
     - `z`: their scaled values: a parameter's is 0..1 in its range, an initial state's in standard deviations
-    - `hessian`: Gauss-Newton matrix, the inverse covariance of `z`; `prior_hessian`: the priors' share
+    - `hessian`: Gauss-Newton matrix, the inverse covariance of `z`
     - `residuals`: (N, outputs) by recording, NaN where missing
     - `sizes`: rms of each output's residuals, where these were not kept
     - `converged`: False where a limit of steps or time ended the refit; `left`: the fall of the cost that
@@ -51,7 +51,6 @@ class Fit:
     samples: int
     at_bound: dict[str, str] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
-    prior_hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     sizes: dict[str, float] = field(default_factory=dict)
     converged: bool = True
     left: float = 0.0
@@ -255,7 +254,6 @@ def _result(problem: Problem, top: Climbed[Found]) -> Fit:
         problem.samples,
         at_bound,
         problem.priors,
-        problem.prior_terms(values, True)[2],
         converged=top.converged,
         left=2 * top.left,
     )

@@ -71,7 +71,6 @@ class Simulation:
     dx: np.ndarray | None = None
     dy: np.ndarray | None = None
     steps: int = 0
-    rejected: int = 0
 
 
 class _Forces(ctypes.Structure):
@@ -406,7 +405,7 @@ class Model:
         if self.code.fmus and not np.isfinite(y).all():
             row = int(np.argmin(np.isfinite(y).all(axis=1)))
             raise SimulationError(f"{excitation.name}: the FMU has no output at t = {excitation.t[row]:g} s")
-        return Simulation(excitation.t, x, y, dx, dy, int(info[0]), int(info[1]))
+        return Simulation(excitation.t, x, y, dx, dy, int(info[0]))
 
     @property
     def _at_once(self) -> bool:
