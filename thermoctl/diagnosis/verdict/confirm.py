@@ -39,6 +39,9 @@ BLOCKS = 8  # parts of each recording
 FLOOR = 0.1  # added to mean squares over the noise: differences between errors far below it are chance
 WIDTH = 2.0  # prior sd of an effect's size about its null value, as a multiple of the refitted size
 DRAWS = 3.0  # n independent normal rows have the participation ratio n / 3
+# An event has a course in time, as a misfit has. Parts of one recording cannot tell them apart, only another
+# recording can.
+UNTOLD = 0.5
 SWEEPS = 2  # solutions; after each, the outputs' weights are computed again
 TINY = 1e-9
 
@@ -173,6 +176,9 @@ class Confirm:
 
     def probability(self, home: Keys, key: Key) -> float:
         """Return the probability that an effect helps a hypothesis to predict."""
+        effects = {e.key: e.candidate.effect for e in self.tried[home].hypothesis.effects}
+        if effects[key].timed and not self.reserve:
+            return UNTOLD
         mine = self._log_energies(home)
         parts = [self._log_energies(keys) for keys in self.tried if keys < home and key not in keys]
         others = [part for part in parts if part is not None]
