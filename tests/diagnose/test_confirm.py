@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from scipy.stats import wilcoxon
 
 from tests.bench.scale import block_plant, recorded
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, signed_rank
 from thermoctl.diagnosis.verdict.decide import Probabilities
 
-A, B = ("radiation", "block"), ("sensor_drift", "reading")
+A, B, DRIFT = ("radiation", "block"), ("sensor_gain", "reading"), ("sensor_drift", "reading")
 NONE, ONE, BOTH = frozenset(), frozenset({A}), frozenset({A, B})
 
 
@@ -34,9 +35,15 @@ def test_an_effect_that_helps_in_one_part_only_is_not_confirmed():
     assert signed_rank(once) < 0.9 < signed_rank(always)
 
 
-def with_errors(energies):
+def with_errors(energies, reserve=()):
     """The test, on stated errors (parts, outputs) of each hypothesis instead of refits."""
-    test = Confirm(SimpleNamespace(), dict.fromkeys(energies), ())
+    entries = catalogue()
+
+    def tried(keys):
+        effects = [SimpleNamespace(key=k, candidate=SimpleNamespace(effect=entries[k[0]])) for k in keys]
+        return SimpleNamespace(hypothesis=SimpleNamespace(effects=effects))
+
+    test = Confirm(SimpleNamespace(), {keys: tried(keys) for keys in energies}, reserve)
     test._known = {keys: np.log(np.array(e)[:, None]) for keys, e in energies.items()}
     return test
 
@@ -60,6 +67,16 @@ def test_a_weaker_effect_without_a_name_leaves_before_a_name():
     kept, after, asked = confirmed(posterior, BOTH, test, 0.9)
     assert kept == ONE and after.effects[A] == asked[A] > 0.99
     assert after.effects[B] == 0.6 and B not in asked
+
+
+def test_an_event_is_confirmed_by_another_recording_only():
+    """A fan that starts is one course in time; a misfit, too, has some course in time."""
+    helps = {NONE: np.full(8, 50.0), frozenset({DRIFT}): np.arange(1.0, 9.0)}
+    posterior = Probabilities({frozenset({DRIFT}): 1.0}, {DRIFT: 1.0}, 1.0)
+    kept, after, _ = confirmed(posterior, frozenset({DRIFT}), with_errors(helps), 0.9)
+    assert kept == NONE and after.effects[DRIFT] == 0.5
+    kept, after, _ = confirmed(posterior, frozenset({DRIFT}), with_errors(helps, reserve=("run_3",)), 0.9)
+    assert kept == frozenset({DRIFT}) and after.effects[DRIFT] > 0.99
 
 
 def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():

@@ -125,6 +125,7 @@ RULES: Mapping[str, Rule] = {
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
     ),
+    "event": Rule("an event needs a recording set aside", {"verdict.confirm._is_event": _no}),
     "only noise": Rule(
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
     ),

@@ -147,6 +147,11 @@ class Blocks:
         return out
 
 
+def _is_event(f: Fitted, key: Key) -> bool:
+    """Return whether an effect depends on the time itself."""
+    return any(e.key == key and e.candidate.effect.timed for e in f.hypothesis.effects)
+
+
 def _squares(sums: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Return the sums of squares (outputs,) after a step of the unknowns."""
     x = np.append(-step, 1.0)
@@ -176,8 +181,7 @@ class Confirm:
 
     def probability(self, home: Keys, key: Key) -> float:
         """Return the probability that an effect helps a hypothesis to predict."""
-        effects = {e.key: e.candidate.effect for e in self.tried[home].hypothesis.effects}
-        if effects[key].timed and not self.reserve:
+        if not self.reserve and _is_event(self.tried[home], key):
             return UNTOLD
         mine = self._log_energies(home)
         parts = [self._log_energies(keys) for keys in self.tried if keys < home and key not in keys]
