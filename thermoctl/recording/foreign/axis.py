@@ -17,9 +17,9 @@ import pyarrow.compute as pc
 
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.clock import ClockError, Seconds
+from thermoctl.recording.foreign.names import COUNTED, is_generic, named, unit_of_time
 from thermoctl.recording.foreign.sheet import Cells, Sheet
-from thermoctl.recording.foreign.units import WORDS, known, spelled, time_unit
-from thermoctl.units import SECONDS
+from thermoctl.recording.foreign.units import known
 
 KINDS = {
     "date and time": 60,
@@ -31,8 +31,7 @@ KINDS = {
     "bare": 0,
 }
 STEP = 50  # points for a column that has the interval stated in the file
-# Points for a name of times, for a name of a counter, for a unit that is not one of time.
-NAMED, COUNTED, FOREIGN = 30, -30, -60
+FOREIGN = -60  # points for a unit that is not one of time
 STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
 NEEDED = 30  # least points of a clock
 # Least points of a clock that is used though another column holds wrong dates, or is named as another.
@@ -43,10 +42,6 @@ _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # large, in ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by
 # chance.
 EVENER, ENOUGH = 0.5, 20
-_TIMES = WORDS["times"].split()
-_COUNTERS = WORDS["counters"].split()
-_OTHERS = WORDS["other_times"].split()
-MOST_WORDS = 3  # largest number of words in a counter's name
 _FIELDS = {  # names of the parts of a date that have a column each
     "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
     "month": ("month", "mm", "mon", "monat", "mois", "mes", "mese"),
@@ -57,8 +52,6 @@ _FIELDS = {  # names of the parts of a date that have a column each
     "minute": ("minute", "min", "mi", "minuto", "minuti"),
     "second": ("second", "ss", "sec", "sekunde", "seconde", "segundo", "secondo"),
 }
-_STEPS = ("step", "index", "number", "no", "nr", "count", "id", "idx")
-_PARTS = re.compile(r"[^\W\d_]+|#|n[°º]", re.UNICODE)
 
 
 @dataclass(frozen=True)
@@ -96,60 +89,6 @@ class Clock:
     def plus(self, points: float) -> Clock:
         """Return the clock with further points."""
         return replace(self, points=self.points + points)
-
-
-def tokens(name: str) -> list[str]:
-    """Return the words of a name in lower case: time, ms of `Time_ms` and of `timeMs`."""
-    split = re.sub(r"([a-zäöü])([A-Z])", r"\1 \2", name)
-    return [p.lower() for p in _PARTS.findall(split)]
-
-
-def named(name: str) -> int:
-    """Return points for a name: of times in any language, of a counter, of another time than the clock."""
-    words = tokens(name)
-    if name.strip() == "T":  # t is a time, T a temperature
-        return 0
-    if any(w in _OTHERS for w in words):
-        return -NAMED
-    if 1 < len(words) <= MOST_WORDS and words[-1] in _STEPS:  # `Time Step` counts
-        return COUNTED
-    if re.fullmatch(r"t|ts|t[_ ]?(s|ms|us|ns|min|h|d|sec|msec)", name.strip()):
-        return NAMED
-    words = [
-        w for k, w in enumerate(words) if w != "data" or k == 0
-    ]  # Italian for a date, English for values
-    if any(w in _TIMES for w in words) or re.match(r"(?i)(date|time|zeit|datum|timestamp)", "".join(words)):
-        return NAMED
-    if "#" in name or any(w in _COUNTERS for w in words[:1]):
-        return COUNTED
-    return 0
-
-
-def is_generic(name: str) -> bool:
-    """Return whether a first column's name says that it is what the others are drawn over."""
-    return bool(
-        re.fullmatch(r"(?i)|column_1|unnamed: 0|x([ _-]?(value|axis|data|wert|achse))?", name.strip())
-    )
-
-
-def unit_of_time(name: str, unit: str | None, is_time: bool = False) -> str | None:
-    """Return the unit of time that a header states, in brackets or as a word of the name.
-
-    `is_time`: the column is a time whatever its name, so that S is the second and not the siemens."""
-    if unit is not None:
-        if is_time or named(name) > 0:
-            return time_unit(unit)
-        return short if (short := spelled(unit)) in SECONDS else None
-    words = tokens(name)
-    for word in reversed(words):
-        short = spelled(word)
-        if (
-            short in SECONDS
-            and (len(word) > 1 or (len(words) > 1 and word == words[-1]))
-            and word not in ("tag", "day")
-        ):
-            return short
-    return None
 
 
 def _run(t: np.ndarray) -> tuple[int, str]:

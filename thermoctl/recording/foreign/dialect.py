@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from thermoctl.files.yamlfile import InputError
-from thermoctl.recording.foreign.axis import named
 from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
-from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words, time_unit
-from thermoctl.units import SECONDS
+from thermoctl.recording.foreign.facts import aligned, facts_of, take_below
+from thermoctl.recording.foreign.names import named
+from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
 
 SAMPLE = 400  # number of first lines from which the dialect is found
 FEW = 5  # in a file with more lines, the head takes at most half of them
@@ -33,15 +33,6 @@ FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (R
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _KINDS = {"", *WORDS["kinds"].split()}
-_STEP = re.compile(
-    r"(?i)^(?:.*(?:sampl\w*|scan|log\w*|record\w*|acqui\w*|mess|abtast)\w*[\s_-]*(?:interval|period|time|rate|freq\w*|clock|step|intervall|zeit|rate)?"
-    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|tinc|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency)\b.*$"
-)
-_INTERVAL = re.compile(
-    r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz"
-)
-_RATE = re.compile(r"(?i)rate|freq|hz")
-_VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
 
 
 @dataclass(frozen=True)
@@ -154,7 +145,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
     width = Counter(len(c) for _, c in _tail(rows)).most_common(1)[0][0]
     begin = _begin(rows, width)
     head = [(n, c) for n, c in rows[:begin]]
-    facts = _facts(
+    facts = facts_of(
         [
             *comments,
             *[(n, line) for n, line in sample if n < (rows[begin][0] if begin < len(rows) else 1 << 60)],
@@ -315,8 +306,8 @@ def _header(
             stated = (spelled(_bare(c), n) for c, n in zip(_widened(row, width, data), names, strict=True))
             units |= {n: u for n, u in zip(names, stated, strict=True) if u and known(u)}
             notes.append(f"line {number} read as units")
-            _below(lines_of[-1][1], row, facts)
-    units |= _aligned(facts, names, units)
+            take_below(lines_of[-1][1], row, facts)
+    units |= aligned(facts, names, units)
     return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
 
 
@@ -404,87 +395,6 @@ def _commented(
             cells = cells_of(text, sep)
             if len(cells) == width and not any(_kind(c) in "t" for c in cells):
                 return number, cells
-    return None
-
-
-def _facts(above: list[tuple[int, str]], separator: str) -> dict[str, list[str]]:
-    """Return the statements of the lines above the header: `Delta_X <tab> 0.1`, `Interval: 0.5 s`."""
-    facts: dict[str, list[str]] = {}
-    for _, line in above:
-        cells = [
-            c.strip().strip('"')
-            for c in line.split(separator if separator.strip() or separator == "\t" else "\t")
-        ]
-        if len(cells) < 2 and (match := re.match(r"([^:=]{2,40})[:=]\s*(.+)$", line)):  # noqa: PLR2004
-            cells = [match[1].strip(), match[2].strip()]
-        elif len(cells) > 1 and cells[0].endswith((":", "=")):
-            cells[0] = cells[0][:-1].strip()
-        if len(cells) > 1 and cells[0]:
-            facts.setdefault(cells[0].lower(), cells[1:])
-    return facts
-
-
-def _below(cells: list[str], row: list[str], facts: dict[str, list[str]]) -> None:
-    """Take Start and Increment of an oscilloscope from the line below the header (Rigol)."""
-    for name, value in zip(cells, row, strict=False):
-        if name.lower() in ("start", "increment"):
-            facts[name.lower()] = [value]
-
-
-def _aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str]) -> dict[str, str]:
-    """Return units of lines above the header that name them by column: LVM, oscilloscopes."""
-    found: dict[str, str] = {}
-    for key, values in facts.items():
-        if re.search(r"(?i)^(y_?|vert\w*[ _]?|v)?(unit|einheit)", key) and any(
-            known(_own(v)) for v in values
-        ):
-            while len(values) > len(names) - 1 and not values[-1]:
-                values = values[:-1]
-            columns = names if len(values) == len(names) else names[1:]
-            found |= {
-                n: str(spelled(_own(v), n))
-                for n, v in zip(columns, values, strict=False)
-                if known(_own(v)) and n not in units
-            }
-        elif (
-            re.search(r"(?i)^(x_?|hor\w*[ _]?|h)(unit|einheit)", key)
-            and time_unit(values[0])
-            and names[0] not in units
-            and named(names[0]) > 0
-        ):
-            found[names[0]] = values[0]
-    return found
-
-
-def _own(unit: str) -> str:
-    """Return the unit of `CH1:V` (Siglent) and of `V`."""
-    return unit.rpartition(":")[2]
-
-
-def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
-    """Return the interval between rows that a file states above its header, and the first time, s."""
-    start = 0.0
-    for key in ("start", "x0", "t0", "xoffset", "hoffset", "trigger offset"):
-        if key in facts and (match := _VALUE.match(facts[key][0])):
-            start = float(match[1].replace(",", "."))
-    for key, values in facts.items():
-        if not _STEP.match(key):
-            continue
-        filled = [v for v in values if v]
-        match = _VALUE.match(filled[0]) if filled else None
-        if match is None:
-            continue
-        size = float(match[1].replace(",", "."))
-        if not _INTERVAL.search(key) and not time_unit(match[2]):
-            continue  # `Samples 600` states the number of samples, `Sampling 1s` their interval
-        stated = (
-            match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
-        )
-        unit = time_unit(stated) or spelled(stated) or ("Hz" if _RATE.search(key) else "s")
-        if unit in SECONDS and size > 0 and "rate" not in key:
-            return size * SECONDS[unit], start
-        if unit in ("Hz", "kHz", "MHz", "Sa/s", "S/s", "1/s") and size > 0:
-            return 1 / (size * {"kHz": 1e3, "MHz": 1e6}.get(unit, 1.0)), start
     return None
 
 

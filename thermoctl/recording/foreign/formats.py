@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.clock import Seconds
-from thermoctl.recording.foreign.dialect import stated_step
+from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table

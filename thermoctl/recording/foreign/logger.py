@@ -25,8 +25,8 @@ import pyarrow.parquet
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
-from thermoctl.recording.foreign import axis
 from thermoctl.recording.foreign.dialect import cells_of, lines
+from thermoctl.recording.foreign.names import tokens
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
 from thermoctl.recording.foreign.timing import table_of
@@ -132,7 +132,7 @@ def _plain(path: Path) -> bool:
     others = [
         n
         for n in names
-        if n not in ("t", "t_s", "wall_s") and {"time", "zeit", "date", "timestamp"} & set(axis.tokens(n))
+        if n not in ("t", "t_s", "wall_s") and {"time", "zeit", "date", "timestamp"} & set(tokens(n))
     ]
     filled = [c for c in (rows[0] if rows else ()) if c and c.lower() != "nan"]
     return not others and all(re.fullmatch(r"-?\d*\.?\d+(?:[eE][-+]?\d+)?|-?\d+\.", c) for c in filled)

@@ -22,8 +22,8 @@ from thermoctl.recording.foreign.dialect import (
     find_dialect,
     is_comment,
     lines,
-    stated_step,
 )
+from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.sheet import Cells, How, Sheet
 from thermoctl.recording.foreign.timing import table_of
 from thermoctl.recording.foreign.units import split_words

@@ -17,6 +17,7 @@ from thermoctl.recording.foreign import axis, cells, clock
 from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
 from thermoctl.recording.foreign.clock import ClockError, Seconds
+from thermoctl.recording.foreign.names import named, tokens
 from thermoctl.recording.foreign.sheet import How, Sheet
 from thermoctl.recording.foreign.units import column_of, interval
 from thermoctl.recording.table import Table
@@ -188,7 +189,7 @@ def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
     """Refuse a counter, or a number of no unit, as the clock beside times that cannot be read."""
     sure = not counter.counter and (counter.seconds.kind != "bare" or any(map(_plain_time, counter.columns)))
     for name, word in () if sure or not counter.why else sheet.left.items():
-        if axis.named(name) > 0 and any(c.isdigit() for c in word):
+        if named(name) > 0 and any(c.isdigit() for c in word):
             what = "counter" if counter.counter else "column"
             raise InputError(
                 f"{sheet.place(0)}: column '{name}': '{word.strip()}' is no time in a form that is known, and the only other "
@@ -198,7 +199,7 @@ def _refuse_lost(sheet: Sheet, counter: Clock) -> None:
 
 def _plain_time(name: str) -> bool:
     """Return whether a name is a time and nothing else, such as `t`, `Time` or `Zeit`."""
-    return axis.named(name) > 0 and len(axis.tokens(name)) == 1
+    return named(name) > 0 and len(tokens(name)) == 1
 
 
 def _plain(name: str) -> str:
@@ -223,7 +224,7 @@ def _final_names(path: Path, sheet: Sheet, used: Sequence[str]) -> tuple[dict[st
     final: dict[str, str] = {}
     notes = []
     for plain, names in alike.items():
-        another_time = "\0" in names[-1] and axis.named(plain) > 0  # nobody knows which columns it times
+        another_time = "\0" in names[-1] and named(plain) > 0  # nobody knows which columns it times
         if len(names) == 1 and plain and not another_time:
             final[names[0]] = plain
             continue
