@@ -25,7 +25,7 @@ _ZONES |= dict(est=-5, edt=-4, cdt=-5, mst=-7, mdt=-6, pst=-8, pdt=-7, jst=9, ks
 _LETTER = r"[^\x00-\x40\x5B-\x60\x7B-\x7F]"
 _DATE = r"(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|{L}{3,4})[-/.](?P<c>\d{1,4})".replace("{L}", _LETTER)
 _CLOCK = (
-    r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9}))?)?\s*(?P<p>[AaPp][Mm])?"
+    r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9})\d*)?)?\s*(?P<p>[AaPp][Mm])?"
     r"\s*(?P<z>[+-]\d{2}:?\d{2}|[A-Za-z]{1,4})?"
 )
 _PATTERN = rf"^(?:{_DATE}(?:[T ,;]\s*|$))?(?:{_CLOCK})?$"
@@ -34,13 +34,15 @@ _SPELLINGS = tuple(
     (pattern.replace("{L}", _LETTER), by)
     for pattern, by in (
         (r"^(?:(?i:mon|tue|wed|thu|fri|sat|sun|mo|di|mi|do|fr|sa|so){L}*\.?,?\s+)(\d|{L})", r"\1"),
+        (r"^(\d\S*[T ]\d{1,2}:\d{2}(?::[\d.]+)?Z?)(?:/| - )\d.*$", r"\1"),  # from one time to another
         (r"([ap])\.\s?m\.", r"\1m"),
+        (r"^(\d{1,2}:\d{2}\S*(?: [AaPp][Mm])?),? (\d{1,4}[-/.](?:\d{1,2}|{L}{3,})[-/.]\d{2,4})$", r"\2 \1"),
         (r"^({L}{3}){L}*\.?\s+(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2}\S*)\s+(\d{4})$", r"\2-\1-\4 \3"),
         (r"^({L}{3}){L}*\.?\s+(\d{1,2}),?\s+(\d{4})", r"\2-\1-\3"),
         (r"^(\d{1,2})\.?[ -]({L}{3}){L}*\.?,?[ -](\d{2,4})([ ,T]|$)", r"\1-\2-\3\4"),
         (r"^(\d{4})年(\d{1,2})月(\d{1,2})日", r"\1-\2-\3"),
         (r"^((?:19|20)\d{2})(\d{2})(\d{2})$", r"\1-\2-\3"),
-        (r"^((?:19|20)\d{2})(\d{2})(\d{2})[T _-]?(\d{2})(\d{2})$", r"\1-\2-\3 \4:\5"),
+        (r"^((?:19|20)\d{2})(\d{2})(\d{2})[T _:-]?(\d{2})(\d{2})$", r"\1-\2-\3 \4:\5"),
         (
             r"^((?:19|20)\d{2})(\d{2})(\d{2})[T _-]?(\d{2})(\d{2})(\d{2})[.,]?(\d*)(Z?)$",
             r"\1-\2-\3 \4:\5:\6.\7\8",
@@ -50,6 +52,8 @@ _SPELLINGS = tuple(
         (r"^(\d{4}:\d{2}:\d{2}) (\d)", r"\1T\2"),
         (r"\.(Z?)$", r"\1"),
         (r"^(\d{1,2})/(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2})$", r"1900-\1-\2 \3"),  # EnergyPlus states no year
+        (r"(^|[^\d:])(\d{1,4}):(\d):(\d)", r"\1\2:0\3:\4"),  # 9:5:3 of an Arduino
+        (r"(^|[^\d:])(\d{1,4}:\d{2}):(\d)($|\D)", r"\1\2:0\3\4"),
         (r"^(\d{1,3}):(\d{2})([.,]\d+)$", r"0:\1:\2\3"),
         (r"\s*\(?(?:GMT|UTC)([+-])(\d)(?::?(\d{2}))?\)?$", r"\g<1>0\2:\3"),
         (r"\s*\(?(?:GMT|UTC)([+-])(\d{2}):?(\d{2})?\)?$", r"\1\2:\3"),
@@ -168,6 +172,9 @@ def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Se
     for name, scale, zero, low, high in EPOCHS if len(finite) else ():
         stated = unit is None or abs(SECONDS.get(unit, np.nan) - scale) < 1e-9 * scale
         if stated and low <= finite.min() and finite.max() <= high and (dated or low > LONG):
+            if scale == DAY_S:
+                values = _of_days(values)
+                finite = values[np.isfinite(values)]
             start = _date(finite[0] * scale + zero)
             where = " UTC" if name.startswith("unix") else ""
             t = (values - finite[0]).astype(float) * scale
@@ -181,6 +188,14 @@ def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Se
     return Seconds(
         np.asarray(values, float), None, "" if unit is None else f"unit '{unit}' is no time; read as s"
     )
+
+
+def _of_days(days: np.ndarray) -> np.ndarray:
+    """Return days (N,) without their rounding: of 44512.66008, to 0.864 s, the whole second."""
+    for size, whole_s in ((1e-4, 10.0), (1e-5, 1.0), (1e-6, 0.1)):
+        if np.nanmax(np.abs(days / size - np.round(days / size))) < 1e-3:  # noqa: PLR2004
+            return np.round(days * DAY_S / whole_s) * whole_s / DAY_S
+    return days
 
 
 def _date(seconds: float) -> str:
@@ -237,7 +252,9 @@ def from_texts(texts: pa.Array) -> Seconds:
         return Seconds((ns - ns[0]) / 1e9, None, note, "time of day")
     if not dated.all():
         raise ClockError(int(np.argmin(dated)), "a time without a date among dates")
-    ns, order = _dated(field, clock)
+    halves = pc.any(pc.not_equal(field["p"], "")).as_py()
+    american = halves and not pc.match_substring_regex(tidy, r"^\d+\.\d+\.")[0].as_py()
+    ns, order = _dated(field, clock, american)
     timed = bool(pc.any(pc.not_equal(field["h"], "")).as_py())
     zone = field["z"][0].as_py()
     seconds = _since(
@@ -305,14 +322,19 @@ def _clock_ns(field: dict[str, pa.Array]) -> np.ndarray:
         elif text and text.lower() in _ZONES:
             zone[here] = 60 * _ZONES[text.lower()] if len(names) > 1 else 0
         elif len(names) > 1:
-            raise ClockError(
-                int(np.argmax(here)), f"the zone '{text}' among others is not known; write the times in UTC"
+            what = (
+                f"the zone '{text}' among others is not known"
+                if text
+                else "a time without a zone among others"
             )
+            raise ClockError(int(np.argmax(here)), f"{what}; write the times in UTC")
     return ((hour * 60 + minute - zone) * 60 + second) * 1_000_000_000 + fraction
 
 
-def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, str]:
-    """Nanoseconds since 1970, and the order of year, month and day that was found."""
+def _dated(field: dict[str, pa.Array], clock: np.ndarray, american: bool) -> tuple[np.ndarray, str]:
+    """Return nanoseconds since 1970, and the order of year, month and day.
+
+    `american`: the month is first where either can be."""
     middle = pc.utf8_lower(field["b"])
     named = [t for t in pc.unique(middle).to_pylist() if t.isalpha()]
     for text in named:
@@ -338,7 +360,7 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray) -> tuple[np.ndarray, s
     if "year/month/day" in by_order and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
         prefer = ["year/month/day", *orders]
     else:
-        prefer = ["month/day/year", *orders] if pc.any(pc.not_equal(field["p"], "")).as_py() else list(orders)
+        prefer = ["month/day/year", *orders] if american else list(orders)
     return _one_order(by_order, prefer)
 
 
@@ -354,9 +376,11 @@ def _one_order(possible: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.n
         even, uneven = {}, 0
         for order, ns in possible.items():
             steps = np.diff(ns)
-            if len(steps) > 1 and steps.max() <= 3 * np.sort(steps)[(len(steps) - 1) // 2]:
+            within = steps[np.diff(ns // DAY_NS) == 0]  # as long in any order
+            usual = within.max(initial=0) or (np.sort(steps)[(len(steps) - 1) // 2] if len(steps) > 1 else 0)
+            if 0 < steps.max() <= 3 * usual:
                 even[order] = ns
-            uneven += len(steps) > 1 and steps.max() > 20 * max(steps.min(), 1)
+            uneven += steps.max() > 20 * max(usual, 1)
         if len(even) != 1 or uneven != len(possible) - 1:
             raise ClockError(0, "day and month cannot be told apart; write the dates as 2026-03-14")
         possible = even
