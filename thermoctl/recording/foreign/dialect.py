@@ -19,7 +19,8 @@ from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.facts import aligned, facts_of, take_below
 from thermoctl.recording.foreign.names import named
-from thermoctl.recording.foreign.units import WORDS, known, spelled, split_unit, split_words
+from thermoctl.recording.foreign.units import WORDS, known, spelled, split_slash, split_unit, split_words
+from thermoctl.units import SECONDS
 
 SAMPLE = 400  # number of first lines from which the dialect is found
 FEW = 5  # in a file with more lines, the head takes at most half of them
@@ -30,6 +31,9 @@ _COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|
 # The line below the header of a table in Markdown or SQL.
 _RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")
 FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (Rigol)
+# LabVIEW and Bio-Logic state where the header ends; its last line has the names.
+_HEADER_END = re.compile(r"\*{3}End_of_Header\*{3}|Nb header lines\W+(\d+)")
+_TWO = re.compile(r"[-+]?[\d.]+(?: [-+]?[\d.]+)+$")  # numbers between single blanks
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _KINDS = {"", *WORDS["kinds"].split()}
@@ -160,7 +164,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
     facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
     decimal = _decimal(data, separator)
-    if separator != ",":
+    if separator != "," and width > 1:
         shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
         notes.append(f"separator {shown}" + (", decimal comma" if decimal == "," else ""))
     return Dialect(
@@ -182,7 +186,9 @@ def _separator(
             continue
         tail = [c for _, c in _tail(rows)]
         width, lines_of = Counter(len(c) for c in tail).most_common(1)[0]
-        if width < 2:  # noqa: PLR2004
+        if width < 2 or (separator == "," and len(rows[0][1]) == 1 and _all_commas(sample)):  # noqa: PLR2004
+            continue
+        if separator == "  " and any(_TWO.match(x) for c in tail for x in c):
             continue
         cells = [x for c in tail if len(c) == width for x in c]
         good = sum(_kind(x) != "w" for x in cells)
@@ -191,6 +197,9 @@ def _separator(
             score += 0.005  # a decimal comma rather than two columns
         if best is None or score > best[0] + 1e-9:
             best = score, separator, rows
+    alone = [(n, [line.strip()]) for n, line in sample]
+    if best is None and all(_kind(c[0]) in "n-" for _, c in _tail(alone)):
+        return "\t", alone
     if best is None or best[0] < 0.3:  # noqa: PLR2004
         shown = sample[0][1][:60]
         raise InputError(
@@ -200,8 +209,19 @@ def _separator(
     return best[1:]
 
 
+def _all_commas(sample: list[tuple[int, str]]) -> bool:
+    """Return whether each line that decides is one number with a decimal comma."""
+    return all(_COMMA.match(c[0].strip()) for _, c in _tail([(n, [line]) for n, line in sample]))
+
+
 def _tail(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
-    """Return the rows that are data most likely: the later half, of a few all but the first."""
+    """Return the rows that are data most likely: the later half, of a few all but the first.
+
+    Where the file states the end of its header, all below it."""
+    for n, cells in rows:
+        if match := _HEADER_END.match(" ".join(cells)):
+            names = int(match[1] or n + 1)
+            rows = [r for r in rows if r[0] > names] or rows
     return rows[len(rows) // 2 if len(rows) > FEW else 1 :] or rows
 
 
@@ -290,16 +310,15 @@ def _header(
     while len(lines_of) > 1 and below and sum(bool(c) for c in lines_of[-1][1]) < width / 2:
         lines_of.pop()
     line, cells = lines_of[-1]
-    short = len(cells) == width - 1
     cells = _widened(cells, width, data)
-    if short and not cells[0]:
+    if cells[1:] == lines_of[-1][1]:
         _index(path, line, width, data, notes)
-    split = [split_words(c) for c in cells]
+    split = list(map(split_slash if _slashed(cells) else split_words, cells))
     names = [n for n, _ in split]
     # If the names of two columns differ only by their units, the units stay part of the names.
     named_so = {n: {c for c, (m, _) in zip(cells, split, strict=True) if m == n} for n in names}
     names = [c if len(named_so[n]) > 1 else n for c, n in zip(cells, names, strict=True)]
-    names = _distinct(names)
+    names = distinct(names)
     units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}
     for number, row in below:
         if not _is_kinds(row):
@@ -309,6 +328,14 @@ def _header(
             take_below(lines_of[-1][1], row, facts)
     units |= aligned(facts, names, units)
     return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
+
+
+def _slashed(cells: list[str]) -> bool:
+    """Return whether a header writes units as `I/mA`: its time does, or half of its cells.
+
+    Elsewhere a slash parts the levels of a name: `kitchen/V`."""
+    split = [split_slash(c) for c in cells if split_slash(c) != split_words(c)]
+    return any(u in SECONDS and named(n) > 0 for n, u in split) or 2 * len(split) > sum(map(bool, cells))
 
 
 def _paired(
@@ -370,7 +397,7 @@ def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list
     notes.append("the header has one name less than the rows have cells: it lacks the first column's name")
 
 
-def _distinct(names: list[str]) -> list[str]:
+def distinct(names: list[str]) -> list[str]:
     """Return names that differ: a repeated or missing one gets \\0 and its place, the first a blank."""
     if not names[0]:
         names = [" ", *names[1:]]

@@ -16,6 +16,7 @@ _STEP = re.compile(
 _INTERVAL = re.compile(
     r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz"
 )
+_DURATION = re.compile(r"(?i)(?:record|log|acqui|mess)\w*[\s_-]*(?:time|zeit)")  # of the whole recording
 _RATE = re.compile(r"(?i)rate|freq|hz")
 _VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
 
@@ -81,7 +82,7 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
         if key in facts and (match := _VALUE.match(facts[key][0])):
             start = float(match[1].replace(",", "."))
     for key, values in facts.items():
-        if not _STEP.match(key):
+        if not _STEP.match(key) or _DURATION.match(key):
             continue
         filled = [v for v in values if v]
         match = _VALUE.match(filled[0]) if filled else None

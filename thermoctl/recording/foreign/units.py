@@ -96,6 +96,14 @@ def split_words(header: str) -> tuple[str, str | None]:
     return name, unit
 
 
+def split_slash(header: str) -> tuple[str, str | None]:
+    """Return name and unit of a header that also may be `I/mA` or `Capacity/mAh/g`; W/m2 is a unit."""
+    first, last = header.partition("/"), header.rpartition("/")
+    name, _, unit = first if known(first[2]) else last
+    is_name = name == "T" or (name and not known(name))  # T/°C is no tesla
+    return (name, spelled(unit, name)) if is_name and known(unit) else split_words(header)
+
+
 def column_of(name: str, columns: Container[str], units: Mapping[str, str]) -> str | None:
     """Return the column of a name, also of one with its unit as in the file's header; None without one."""
     plain, unit = split_words(name)
