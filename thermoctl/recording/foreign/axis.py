@@ -17,12 +17,12 @@ import pyarrow.compute as pc
 
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.clock import ClockError, Seconds
-from thermoctl.recording.foreign.names import COUNTED, is_generic, named, unit_of_time
+from thermoctl.recording.foreign.names import COUNTED, NAMED, is_generic, named, unit_of_time
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import known
 
 KINDS = {
-    "date and time": 60,
+    "date and time": 62,
     "date": 30,
     "time of day": 45,
     "duration": 45,
@@ -82,7 +82,14 @@ class Clock:
     def where(self) -> str:
         """Return the columns' names for people."""
         return (
-            " and ".join(repr(c.strip()) if c.strip() else "the first column" for c in self.columns)
+            " and ".join(
+                f"column {int(place) + 1}"
+                if place and not name
+                else repr(name)
+                if name
+                else "the first column"
+                for name, _, place in (c.strip(" ").partition("\0") for c in self.columns)
+            )
             or "the rows"
         )
 
@@ -208,7 +215,10 @@ def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: 
     generic = position == 0 and is_generic(name) and len(sheet.columns) > 1
     steps = np.diff(seconds.t[np.isfinite(seconds.t)])
     counter = kind == "bare" and len(steps) > 0 and bool(np.all(steps == COUNTER))
-    counter = counter and (by_name == COUNTED or (generic and not name.strip().lower().startswith("x")))
+    with_x = name.strip().lower().startswith("x") and sheet.step_s is None
+    counter = counter and (by_name == COUNTED or (generic and not with_x))
+    if generic and not counter and not by_name and sheet.step_s is not None:
+        by_name = NAMED  # X_Value of LabVIEW, beside a nominal interval
     points = KINDS[kind] + by_name + running + (FIRST if position == 0 else 0)
     why = [kind]
     if by_name:
@@ -372,7 +382,7 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
     names = list(sheet.columns)
     twins = {
         c.columns[0]
-        for c in good
+        for c in ranked
         if len(c.columns) == 1
         and "\0" in c.columns[0]
         and np.array_equal(c.seconds.t, best.seconds.t, equal_nan=True)
@@ -419,6 +429,7 @@ def _rivals(sheet: Sheet, best: Clock, others: list[Clock]) -> list[Clock]:
         same_name = _stem(name) == _stem(best.columns[0]) if best.columns else False
         n = min(len(other.seconds.t), len(best.seconds.t))
         same = np.array_equal(other.seconds.t[:n], best.seconds.t[:n], equal_nan=True)
+        same = same and other.seconds.start == best.seconds.start
         if same_name and other.seconds.kind == best.seconds.kind and name in followed and not same:
             rivals.append(other)
             taken.add(name)

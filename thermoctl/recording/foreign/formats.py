@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.clock import Seconds
+from thermoctl.recording.foreign.dialect import distinct
 from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
@@ -329,9 +330,7 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
     sheet = Sheet(
         {}, _row_of(path), meta={k: v for k, v in said.items() if k not in ("pandas", "ARROW:schema")}
     )
-    for name, column, kind in zip(arrow.column_names, arrow.columns, arrow.schema, strict=True):
-        if name in sheet.columns:
-            raise InputError(f"{path}: the column '{name}' stands twice")
+    for name, column, kind in zip(distinct(arrow.column_names), arrow.columns, arrow.schema, strict=True):
         column = column.combine_chunks()
         column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
         if pa.types.is_timestamp(column.type):

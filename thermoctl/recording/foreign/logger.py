@@ -29,7 +29,7 @@ from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.names import tokens
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
-from thermoctl.recording.foreign.timing import table_of
+from thermoctl.recording.foreign.timing import MIXED, table_of
 from thermoctl.recording.foreign.units import column_of, split_unit
 from thermoctl.recording.table import Table
 
@@ -106,6 +106,8 @@ def _is_ours(path: Path, how: How) -> bool:
     if kind != "parquet":
         return False
     fields = pa.parquet.read_schema(path)
+    if len(set(fields.names)) < len(fields.names):
+        return False
     numbers = all(pa.types.is_floating(f.type) or pa.types.is_integer(f.type) for f in fields)
     return numbers and bool({"t", "t_s"} & set(fields.names)) and not any(f.metadata for f in fields)
 
@@ -162,6 +164,8 @@ def joined(parts: Sequence[Table]) -> Table:
     Files with dates are placed by them, others follow by their times."""
     first = parts[0]
     starts = [p.meta.get("start") for p in parts]
+    if len({str(s).endswith("Z") for s in starts if s}) > 1:
+        raise InputError(f"{parts[1].path}: {MIXED}")
     if len(parts) > 1 and all(starts):
         since = [np.datetime64(str(s).removesuffix("Z")) for s in starts]
         offsets = [float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since]

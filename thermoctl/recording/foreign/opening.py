@@ -126,7 +126,7 @@ _READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
     "mdf": lambda path, how, notes: formats.read_mdf(path, notes),
     "tdms": lambda path, how, notes: formats.read_tdms(path, notes, how.sheet),
     "mat": lambda path, how, notes: formats.read_mat(path, notes, how.sheet),
-    "parquet": lambda path, how, notes: [formats.read_arrow(path, pa.parquet.read_table(path))],
+    "parquet": lambda path, how, notes: [formats.read_arrow(path, pa.parquet.ParquetFile(path).read())],
     "arrow": _arrow,
     "excel": _excel,
 }

@@ -24,6 +24,7 @@ from thermoctl.recording.table import Table
 
 _ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
 HOUR_S = 3600.0
+MIXED = "times in UTC beside times of a zone that is not stated; write all of them in UTC"
 _SINCE = re.compile(r", from \d{4}-\d\d-\d\d [\d:.]+( UTC)?")
 
 
@@ -279,8 +280,14 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         raise InputError(f"{sheet.place(e.row)}: {e.reason}") from None
     except LookupError as e:
         shown = ", ".join(n for n in names if n.strip() and "\0" not in n)
+        texts = [
+            f"'{_plain(n)}': '{w.strip()[:40]}'"
+            for n, w in sheet.left.items()
+            if sum(map(str.isdigit, w)) > 3
+        ]
+        unread = f"; no time in a form that is known: {', '.join(texts)}" if texts else ""
         raise InputError(
-            f"{path}: no column 't' (time in seconds) and no other that is a time for sure ({e}); the columns are {shown}; "
+            f"{path}: no column 't' (time in seconds) and no other that is a time for sure ({e}{unread}); the columns are {shown}; "
             f"{_ADVICE}"
         ) from None
 
@@ -376,6 +383,8 @@ def _united(path: Path, parts: Sequence[Table]) -> Table:
     starts = [p.meta.get("start") for p in parts]
     offsets = np.zeros(len(parts))
     first = min((s for s in starts if s), default=None)
+    if len({s.endswith("Z") for s in starts if s}) > 1:
+        raise InputError(f"{path}: {MIXED}")
     if all(starts):
         since = [np.datetime64(str(s).removesuffix("Z"), "us") for s in starts]
         offsets = np.array([float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since])

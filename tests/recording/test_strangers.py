@@ -1,0 +1,196 @@
+"""Kinds of files that strangers have: each case is a small text after a file of a real instrument."""
+
+from datetime import datetime, timedelta
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from thermoctl.files.yamlfile import InputError
+from thermoctl.recording.foreign.logger import joined, read_recording
+
+
+def read(folder, text, name="run.csv", **how):
+    path = folder / name
+    path.write_text(text)
+    return read_recording(path, **how)
+
+
+def rows(*lines):
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    "text, name, values",
+    [
+        ("20.5\n21.5\n22.5\n", "column_1", [20.5, 21.5, 22.5]),
+        ("T [degC]\n20.5\n21.5\n22.5\n", "T", [20.5, 21.5, 22.5]),
+        ("T\n20,5\n21,5\n22,5\n", "T", [20.5, 21.5, 22.5]),
+    ],
+)
+def test_one_column_with_a_stated_step(tmp_path, text, name, values):
+    found = read(tmp_path, text, time="0.1s")
+    assert found.columns[name].tolist() == values
+    np.testing.assert_allclose(found.t, [0, 0.1, 0.2])
+
+
+def test_one_column_of_words_is_no_table(tmp_path):
+    with pytest.raises(InputError, match="no columns"):
+        read(tmp_path, "one\ntwo\nthree\n", time="0.1s")
+
+
+def test_rows_end_in_a_separator_that_the_header_lacks(tmp_path):
+    text = rows(",CH1,CH2", "Second,Volt,Volt", *(f"{i}e-3,{i},{2 * i}," for i in range(-3, 3)))
+    found = read(tmp_path, text)
+    assert list(found.columns) == ["CH1", "CH2"] and found.units == {"CH1": "V", "CH2": "V"}
+    np.testing.assert_allclose(found.t, np.arange(-3, 3) / 1000)
+
+
+def test_numbers_between_blanks_have_a_column_each(tmp_path):
+    text = rows(*(f" 2019  56  2 25  0  {i}  {20 + i}.5" for i in range(6)))
+    found = read(tmp_path, text, time="60s")
+    assert len(found.columns) == 7 and found.columns["column_7"].tolist() == [20.5 + i for i in range(6)]
+
+
+LVM = (
+    "LabVIEW Measurement",
+    *(f"Setting_{i}\t{i}" for i in range(9)),
+    "***End_of_Header***\t",
+    "Channels\t1\t\t1",
+    "Delta_X\t{step}\t\t{step}",
+    "***End_of_Header***\t\t\t",
+)
+
+
+@pytest.mark.parametrize("step", ["0.5", "1.0"])
+def test_few_rows_below_a_long_header_and_a_time_beside_each_channel(tmp_path, step):
+    body = [f"{0.5 * i}\t{20 + i}\t{0.5 * i}\t{i}" for i in range(3)]
+    text = rows(*LVM, "X_Value\tT\tX_Value\tP\tComment", *body).format(step=step)
+    found = read(tmp_path, text, "run.lvm")
+    assert list(found.columns) == ["T", "P"] and found.columns["P"].tolist() == [0, 1, 2]
+    assert found.t.tolist() == [0, 0.5, 1]
+
+
+def test_uneven_times_are_used_before_a_nominal_step(tmp_path):
+    times = [0, 0.33, 1.21, 1.53, 1.93, 2.84, 3.83, 7.96]
+    body = [f"{t}\t{20 + i}\tOK" for i, t in enumerate(times)]
+    found = read(tmp_path, rows(*LVM, "X_Value\tT\tComment", *body).format(step=1), "run.lvm")
+    np.testing.assert_allclose(found.t, times)
+
+
+def test_units_behind_a_slash(tmp_path):
+    text = rows(
+        "mode\tox/red\ttime/s\tEwe/V\tI/mA\tCapacity/mAh/g\tQ charge/discharge/mA.h",
+        *(f"1\t0\t{10 * i}\t3.{i}\t{i}\t{i}\t{i}" for i in range(4)),
+    )
+    found = read(tmp_path, text)
+    units = {"Ewe": "V", "I": "mA", "Capacity": "mAh/g", "Q charge/discharge": "mA*h"}
+    assert found.units == units and {"mode", "ox/red"} < set(found.columns)
+    assert found.t.tolist() == [0, 10, 20, 30]
+
+
+def test_a_temperature_before_a_slash(tmp_path):
+    found = read(tmp_path, rows("date;T/°C;RH/%", *(f"07.08.25,00:{m}:00;22;{m}" for m in (10, 20, 30))))
+    assert found.units == {"T": "degC", "RH": "%"} and found.t.tolist() == [0, 600, 1200]
+
+
+@pytest.mark.parametrize("written", ["oC", "ºC", "˚C", "Â°C", "\ufffdC"])
+def test_a_degree_in_another_letter(tmp_path, written):
+    names, units = ["Date", "a", "b", "c"], ["", "lx", written, "lxh"]
+    text = rows(*map(",".join, (names, units)), *(f"2026-03-01 10:00:0{i},1,2{i},3" for i in range(4)))
+    assert read(tmp_path, text).units["b"] == "degC"
+
+
+def test_a_duration_is_no_step(tmp_path):
+    with pytest.raises(InputError, match="no other that is a time"):
+        read(tmp_path, rows("Record time: 815.06", *(f"{42 + i % 3}.5" for i in range(9))))
+
+
+def test_dates_without_a_name_are_finer_than_rounded_days(tmp_path):
+    text = rows(",Date/Time,T", *(f"2021-11-12 15:{m}:00,{44512.66 + m / 1440:.5f},2" for m in (10, 25, 40)))
+    found = read(tmp_path, text)
+    assert found.t.tolist() == [0, 900, 1800]
+
+
+def test_a_time_without_a_name_is_called_by_its_place(tmp_path):
+    text = rows(
+        ",Time,1",
+        "S/N,,0000",
+        "Type,,TGU",
+        "Property,,T",
+        *(f"{i},2021-07-26 14:0{i}:00,2{i}" for i in range(5)),
+    )
+    found = read(tmp_path, text)
+    assert found.t.tolist() == [0, 60, 120, 180, 240]
+    assert any("time from column 2" in n for n in found.notes)
+
+
+def test_a_slash_that_parts_levels_and_units_that_have_one(tmp_path):
+    text = rows("time,kitchen/V,phase/A,W/m2", *(f"{i},{i},{i},{i}" for i in range(4)))
+    found = read(tmp_path, text)
+    assert list(found.columns) == ["kitchen/V", "phase/A", "W/m2"] and not found.units
+
+
+def test_a_share_of_retention_is_no_time(tmp_path):
+    text = rows("CapC/mAh,CapD/mAh,RetentionD/%", *(f"{i % 3},{i % 2},{i}" for i in range(6)))
+    with pytest.raises(InputError, match="no other that is a time"):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    "cells, t",
+    [
+        (["2024/1/5 9:5:3", "2024/1/5 9:5:4", "2024/1/5 10:0:0"], [0, 1, 3297]),
+        (["0d 00:00:0", "0d 00:00:5.05000019073486", "0d 00:01:0.5"], [0, 5.050000190, 60.5]),
+        (["20160101:0010", "20160101:0110", "20160101:0210"], [0, 3600, 7200]),
+        (["2020-06-01T12:00:00.0/2020-06-01T12:01:00.0", "2020-06-01T12:01:00.0/2020-06-01T12:02:00.0"], [0, 60]),
+        (["01.01.2020 00:00 - 01.01.2020 00:15", "01.01.2020 00:15 - 01.01.2020 00:30"], [0, 900]),
+        (["10:00:05:7", "10:00:06:7"], [0, 1]),
+        (["23:30:00 30/Nov/2025", "00:00:00 01/Dec/2025"], [0, 1800]),
+        (["11:30:00 PM 11/30/2025", "12:00:00 AM 12/01/2025"], [0, 1800]),
+    ],
+)  # fmt: skip
+def test_times_in_further_spellings(tmp_path, cells, t):
+    found = read(tmp_path, rows("time,T", *(f"{c},2{i}" for i, c in enumerate(cells))))
+    np.testing.assert_allclose(found.t, t, atol=1e-8)
+
+
+def test_points_part_the_day_first_with_halves_of_the_day_too(tmp_path):
+    found = read(tmp_path, rows("time,T", "10.09.2021 11:59:59 am,20", "10.09.2021 12:00:00 pm,21"))
+    assert str(found.meta["start"]).startswith("2021-09-10T11:59:59") and found.t.tolist() == [0, 1]
+
+
+def test_day_and_month_of_uneven_rows_past_midnight(tmp_path):
+    begin, steps = datetime(2021, 5, 5, 23, 45), [0.01, 0.02, 120, 5, 700, 0.03, 60, 60, 1]
+    stamps = [begin + timedelta(seconds=s) for s in np.cumsum([0, *steps])]
+    text = rows("time,T", *(f"{s:%m/%d/%Y %H:%M:%S.%f},{i}" for i, s in enumerate(stamps)))
+    found = read(tmp_path, text)
+    np.testing.assert_allclose(found.t, np.cumsum([0, *steps]), atol=1e-5)
+
+
+def test_the_error_names_texts_that_may_be_times(tmp_path):
+    with pytest.raises(InputError, match="no time in a form that is known: 'when': 'W05-2026"):
+        read(tmp_path, rows("when,T", *(f"W05-2026 t{i},{20 + i % 2}" for i in range(4))))
+
+
+def test_a_name_twice_in_parquet(tmp_path):
+    numbers = [pa.array([0.0, 1.0]), pa.array([20.0, 21.0]), pa.array([3.0, 4.0])]
+    for time in ("t", "time"):
+        pq.write_table(pa.table(numbers, names=[time, "T", "T"]), tmp_path / "run.parquet")
+        found = read_recording(tmp_path / "run.parquet")
+        assert {n: c.tolist() for n, c in found.columns.items()} == {"T_1": [20, 21], "T_2": [3, 4]}
+        assert any("'T' stands 2 times" in n for n in found.notes)
+
+
+def test_utc_and_local_times_are_not_mixed(tmp_path):
+    stamps = [f"2026-03-01T10:00:0{i}" for i in range(3)]
+    mixed = rows("Time1,A,Time2,B", *(f"{s},{i},{s}.5Z,{i}" for i, s in enumerate(stamps)))
+    with pytest.raises(InputError, match="UTC"):
+        read(tmp_path, mixed)
+    with pytest.raises(InputError, match="a time without a zone among others"):
+        read(tmp_path, rows("time,T", f"{stamps[0]}Z,1", f"{stamps[1]},2"))
+    local = read(tmp_path, rows("time,T", *(f"{s},1" for s in stamps)), "a.csv")
+    utc = read(tmp_path, rows("time,T", *(f"{s.replace('T10', 'T11')}Z,1" for s in stamps)), "b.csv")
+    with pytest.raises(InputError, match="b.csv: times in UTC beside"):
+        joined([local, utc])
