@@ -147,6 +147,8 @@ def test_a_share_of_retention_is_no_time(tmp_path):
         (["2020-06-01T12:00:00.0/2020-06-01T12:01:00.0", "2020-06-01T12:01:00.0/2020-06-01T12:02:00.0"], [0, 60]),
         (["01.01.2020 00:00 - 01.01.2020 00:15", "01.01.2020 00:15 - 01.01.2020 00:30"], [0, 900]),
         (["10:00:05:7", "10:00:06:7"], [0, 1]),
+        (["2025011922", "2025011923", "2025012000"], [0, 3600, 7200]),
+        (["0 23:59:59.5", "1 00:00:00.0"], [86399.5, 86400]),
         (["23:30:00 30/Nov/2025", "00:00:00 01/Dec/2025"], [0, 1800]),
         (["11:30:00 PM 11/30/2025", "12:00:00 AM 12/01/2025"], [0, 1800]),
     ],
@@ -194,3 +196,51 @@ def test_utc_and_local_times_are_not_mixed(tmp_path):
     utc = read(tmp_path, rows("time,T", *(f"{s.replace('T10', 'T11')}Z,1" for s in stamps)), "b.csv")
     with pytest.raises(InputError, match="b.csv: times in UTC beside"):
         joined([local, utc])
+
+
+def test_the_first_row_ends_in_a_serial_number(tmp_path):
+    body = [f"{i + 1},2026-03-01 10:0{i}:00,2{i}.5,4{i}.0" + ",010012345" * (i == 0) for i in range(5)]
+    found = read(tmp_path, rows("EL-USB-2,Time,Celsius(°C),Humidity(%rh),Serial Number", *body))
+    assert found.columns["Celsius"].tolist() == [20.5, 21.5, 22.5, 23.5, 24.5]
+    assert found.units == {"Celsius": "degC", "Humidity": "%"} and found.t[-1] == 240
+    with pytest.raises(InputError, match="5 cells; 4 as in the header"):
+        read(tmp_path, rows("No,Time,Celsius(°C),Humidity(%rh)", *body))
+
+
+@pytest.mark.parametrize(
+    "header, names, units",
+    [
+        ("°C [Kanal 1],%rF [Kanal 2]", ["Kanal 1", "Kanal 2"], {"Kanal 1": "degC", "Kanal 2": "%"}),
+        ("motor[0],axis [2]", ["motor[0]", "axis [2]"], {}),
+        ("motor[1],eta [1]", ["motor[1]", "eta"], {"eta": "1"}),
+        ("Meters/second,W per hour", ["Meters/second", "W per hour"], {}),
+    ],
+)
+def test_brackets_and_rates_in_names(tmp_path, header, names, units):
+    found = read(tmp_path, rows(f"Time [s],{header}", *(f"{i / 2},{i},{i}" for i in range(5))))
+    assert list(found.columns) == names and found.units == units
+    assert found.t.tolist() == [0, 0.5, 1, 1.5, 2]
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        ("timestamp,System [0],Battery [1]", "timezone,PV power,Voltage", "Europe/Berlin (+01:00),W,V"),
+        (",123,123", ",PV power,Voltage", ",Counter,Analog", "dd/MM/yyyy HH:mm:ss,W,V"),
+    ],
+)
+def test_a_long_cell_where_the_time_has_its_unit(tmp_path, head):
+    found = read(tmp_path, rows(*head, *(f"2026-03-01 10:0{i}:00,{i},5{i}.2" for i in range(6))))
+    assert found.units == {"PV power": "W", "Voltage": "V"} and found.columns["Voltage"][0] == 50.2
+
+
+def test_parts_of_a_date_without_a_year(tmp_path):
+    stamps = [datetime(2001, 2, 28, 22) + timedelta(hours=k) for k in range(4)]
+    text = rows("Month,Day,Hour,T", *(f"{s.month},{s.day},{s.hour},{k}" for k, s in enumerate(stamps)))
+    found = read(tmp_path, text)
+    assert found.t.tolist() == [0, 3600, 7200, 10800] and "start" not in found.meta
+
+
+def test_each_line_in_quotes(tmp_path):
+    found = read(tmp_path, rows('"Date;T;P"', *(f'"01.03.2026 10:0{i}:00;2{i},5;{i}"' for i in range(4))))
+    assert found.columns["T"].tolist() == [20.5, 21.5, 22.5, 23.5] and found.t[-1] == 180

@@ -44,8 +44,8 @@ _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 EVENER, ENOUGH = 0.5, 20
 _FIELDS = {  # names of the parts of a date that have a column each
     "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
-    "month": ("month", "mm", "mon", "monat", "mois", "mes", "mese"),
-    "day": ("day", "dd", "tag", "jour", "dia", "día", "giorno"),
+    "month": ("month", "mm", "mo", "mon", "monat", "mois", "mes", "mese"),
+    "day": ("day", "dd", "dy", "tag", "jour", "dia", "día", "giorno"),
     "doy": ("doy", "julian", "jday", "julday", "day_of_year", "dayofyear", "jd"),
     "hour": ("hour", "hh", "hr", "stunde", "heure", "hora", "ora"),
     "hhmm": ("hhmm", "time", "hourmin", "hour_minute"),
@@ -156,7 +156,7 @@ def _digits(values: np.ndarray) -> list[str] | None:
     if values.min() < 19_000_101 or np.any(values != np.round(values)):  # noqa: PLR2004
         return None
     low, high = values.min(), values.max()
-    for size in (1, 10_000, 1_000_000):
+    for size in (1, 100, 10_000, 1_000_000):
         if 19_000_101 * size <= low and high < 21_000_101 * size:
             texts = [str(int(v)) for v in values.tolist()]
             return (
@@ -265,7 +265,8 @@ def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
 def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
     """Return a clock of columns year, month, day, hour ..., or year, day of the year, hhmm (Campbell)."""
     at = {key: n for n in sheet.columns for key, names in _FIELDS.items() if n.strip().lower() in names}
-    if not {"year", "hour"} <= at.keys() and not {"year", "hhmm"} <= at.keys():
+    yearless = "year" not in at and {"month", "day", "hour"} <= at.keys()
+    if not yearless and not {"year", "hour"} <= at.keys() and not {"year", "hhmm"} <= at.keys():
         return None
     if "doy" not in at and not {"month", "day"} <= at.keys():
         return None
@@ -274,6 +275,8 @@ def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
         if not isinstance(c, np.ndarray) or not np.isfinite(c).all() or (key != "second" and np.any(c % 1)):
             return None
     whole = {key: c.astype(np.int64) for key, c in columns.items() if key != "second"}
+    if yearless:  # a typical year
+        whole["year"] = np.full(len(sheet), 2001)
     months = ((whole["year"] - 1970) * 12 + (whole["month"] - 1 if "doy" not in at else 0)).astype(
         "datetime64[M]"
     )
@@ -286,8 +289,11 @@ def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
     t = days * 86_400.0 + hour * 3600.0 + minute * 60.0 + columns.get("second", 0.0)
     start = str(np.datetime64(round(float(t[0]) * 1e3), "ms"))
     used = [key for key in _FIELDS if key in at and not (key in ("month", "day") and "doy" in at)]
-    note = f"{', '.join(used)} put together, from {start.replace('T', ' ')}"
-    return tuple(at[key] for key in used), Seconds(t - t[0], start, note, "date and time")
+    from_date = "of a year that is not stated" if yearless else f"from {start.replace('T', ' ')}"
+    note = f"{', '.join(used)} put together, {from_date}"
+    return tuple(at[key] for key in used), Seconds(
+        t - t[0], None if yearless else start, note, "date and time"
+    )
 
 
 def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds]) -> Seconds | None:

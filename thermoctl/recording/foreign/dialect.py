@@ -47,6 +47,7 @@ class Dialect:
     - `first`: its first line of data, from 1
     - `numeric`: columns of plain numbers, as far as the sample shows
     - `facts`: statements of the lines above the header, by their keys
+    - `longer`: a line of data with cells beyond those of the others
     - `notes`: the guesses"""
 
     separator: str
@@ -58,6 +59,7 @@ class Dialect:
     notes: tuple[str, ...]
     facts: dict[str, list[str]] = field(default_factory=dict)
     header: tuple[str, ...] = ()
+    longer: int = 0
 
 
 def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
@@ -147,6 +149,8 @@ def find_dialect(path: Path, text: str) -> Dialect:
     sample, comments, stated = _sample(path, text)
     separator, rows = _separator(path, sample, (stated,) if stated else SEPARATORS)
     width = Counter(len(c) for _, c in _tail(rows)).most_common(1)[0][0]
+    longer = rows[1][0] if _longer_once(rows, width) else 0
+    rows = [(n, c[:width] if n <= longer else c) for n, c in rows]
     begin = _begin(rows, width)
     head = [(n, c) for n, c in rows[:begin]]
     facts = facts_of(
@@ -158,7 +162,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
     )
     data = [c for _, c in rows[begin:] if len(c) == width]
     first = rows[begin][0] if begin < len(rows) else rows[-1][0] + 1
-    notes: list[str] = []
+    notes = [f"line {longer}: its cells beyond column {width} left out"] if longer else []
     names, units, header, used = _header(path, head, comments, separator, width, data, facts, notes)
     if skipped := sum(1 for n, _ in head if n not in used):
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
@@ -168,7 +172,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
         shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
         notes.append(f"separator {shown}" + (", decimal comma" if decimal == "," else ""))
     return Dialect(
-        separator, decimal, names, units, first, _numeric(names, data), tuple(notes), facts, header
+        separator, decimal, names, units, first, _numeric(names, data), tuple(notes), facts, header, longer
     )
 
 
@@ -236,7 +240,7 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
 
     def is_data(cells: list[str]) -> bool:
         """Return whether half of the cells that should be numbers or times are."""
-        if len(cells) != width or (kinds[0] == "-" and _kind(cells[0]) == "w"):
+        if len(cells) < width or (kinds[0] == "-" and _kind(cells[0]) == "w"):
             return False
         if not expected:
             return all(_kind(c) == "-" for c in cells[1:]) and any(c for c in cells)
@@ -260,6 +264,12 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
     return len(rows)
 
 
+def _longer_once(rows: list[tuple[int, list[str]]], width: int) -> bool:
+    """Return whether only the header and the first row have further cells, such as a serial number (Lascar)."""
+    lengths = [len(c) for _, c in rows]
+    return lengths[:1] == lengths[1:2] != [width] and lengths[0] > width == max(lengths[2:], default=0)
+
+
 def _bare(cell: str) -> str:
     """Return the unit of a cell such as `[degC]`, `(degC)` or `in degC`."""
     text = cell.strip()
@@ -275,7 +285,7 @@ def _is_units(cells: list[str], above: list[str]) -> bool:
     right = sum(known(c) for c in bare)
     names = sum(bool(c) and (not is_number(c) or re.fullmatch(r"\d{1,3}", c) is not None) for c in above)
     return (
-        all(len(c) <= UNIT_LENGTH for c in bare)
+        all(len(c) <= UNIT_LENGTH for c in bare[1:])
         and right > 0
         and 2 * right > len(words)
         and 2 * names >= len(above) > 1

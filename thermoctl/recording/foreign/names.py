@@ -58,6 +58,9 @@ def unit_of_time(name: str, unit: str | None, is_time: bool = False) -> str | No
         if is_time or named(name) > 0:
             return time_unit(unit)
         return short if (short := spelled(unit)) in SECONDS else None
+    before = re.match(r"(.+?)(?:/| per )", name)
+    if before and named(before[1]) <= 0:  # m/s and W per hour are rates
+        return None
     words = tokens(name)
     for word in reversed(words):
         short = spelled(word)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +42,7 @@ MAGIC = (
     (b"\xd0\xcf\x11\xe0", "xls"),
     (b"\x1f\x8b", "gzip"),
 )
+_QUOTED = re.compile(rb'^"([^"\n]*[,;\t][^"\n]*[,;\t][^"\n]*)"\r?$', re.MULTILINE)  # a row that is one cell
 _SUFFIXES = {
     ".mf4": "mdf",
     ".mdf": "mdf",
@@ -138,6 +140,9 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
+    if len(_QUOTED.findall(text[:HEAD])) > 1 and len(_QUOTED.findall(text)) == text.strip().count(b"\n") + 1:
+        text = _QUOTED.sub(rb"\1", text)
+        notes.append("each line stands in quotes; read without them")
     dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
     how.trace.append(f"read as: {_described(dialect)}")
     notes += dialect.notes
@@ -233,6 +238,7 @@ def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
     for line, content in lines(text.decode("utf-8")):
         cells = cells_of(content, dialect.separator) if line >= dialect.first else []
         cells = cells[:-1] if len(cells) == width + 1 and not cells[-1] else cells
+        cells = cells[:width] if line == dialect.longer else cells
         if cells and (cells in headers or (again and again[-1] == line - 1 and not _any_value(cells))):
             again.append(line)
         elif any(cells):

@@ -73,6 +73,10 @@ def split_unit(header: str) -> tuple[str, str | None]:
         return text, None
     name, square, bracket, slash = match.groups()
     unit = (square if square is not None else bracket if bracket is not None else slash).strip()
+    if square is not None and known(name) and not known(unit):  # °C [Kanal 1] of Testo
+        return unit, spelled(name, unit)
+    if unit.isdigit() and (unit != "1" or not text[match.end(1)].isspace()):  # motor[1] is a motor
+        return text, None
     if square is None and not known(unit):
         return text, None
     return name.strip(), spelled(unit, name)
