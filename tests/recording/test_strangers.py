@@ -2,6 +2,7 @@
 
 from datetime import datetime, timedelta
 
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -244,3 +245,31 @@ def test_parts_of_a_date_without_a_year(tmp_path):
 def test_each_line_in_quotes(tmp_path):
     found = read(tmp_path, rows('"Date;T;P"', *(f'"01.03.2026 10:0{i}:00;2{i},5;{i}"' for i in range(4))))
     assert found.columns["T"].tolist() == [20.5, 21.5, 22.5, 23.5] and found.t[-1] == 180
+
+
+def test_hdf5_of_other_programs(tmp_path):
+    path, ns = tmp_path / "run.h5", 1_772_359_200_000_000_000 + 10**9 * np.arange(9)
+    table = np.zeros(9, dtype=[("time", "f8"), ("T", "f4"), ("axes", "f8", (2,))])
+    table["time"], table["T"] = np.arange(9) / 2, 20 + np.arange(9)
+    with h5py.File(path, "w") as file:
+        file["rig/time"] = np.arange(9) / 2
+        file["rig/T"] = 20.0 + np.arange(9)
+        file["rig/T"].attrs["units"] = "°C"
+        file["table"] = table
+        file["frame/axis0"] = [b"T", b"P"]
+        file["frame/axis1"] = ns
+        file["frame/axis1"].attrs["kind"] = b"datetime64"
+        file["frame/block0_items"] = [b"T", b"P"]
+        file["frame/block0_values"] = np.arange(18.0).reshape(9, 2)
+    rig, frame = read_recording(path, sheet="rig"), read_recording(path, sheet="frame")
+    assert rig.units == {"T": "degC"} and rig.t[-1] == 4 and rig.columns["T"].tolist() == [*range(20, 29)]
+    assert list(frame.columns) == ["T", "P"] and frame.t[-1] == 8 and frame.columns["P"][-1] == 17
+    largest = read_recording(path)
+    assert list(largest.columns) == ["T", "axes_1", "axes_2"] and any(
+        "--sheet GROUP" in n for n in largest.notes
+    )
+    with pytest.raises(InputError, match="no group 'rug'.*rig"):
+        read_recording(path, sheet="rug")
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(InputError, match="not a whole HDF5 file"):
+        read_recording(path)

@@ -265,7 +265,7 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
 
 
 def _longer_once(rows: list[tuple[int, list[str]]], width: int) -> bool:
-    """Return whether only the header and the first row have further cells, such as a serial number (Lascar)."""
+    """Return whether only the header and the first row have further cells: a serial number (Lascar)."""
     lengths = [len(c) for _, c in rows]
     return lengths[:1] == lengths[1:2] != [width] and lengths[0] > width == max(lengths[2:], default=0)
 

@@ -16,7 +16,7 @@ _STEP = re.compile(
 _INTERVAL = re.compile(
     r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz"
 )
-_DURATION = re.compile(r"(?i)(?:record|log|acqui|mess)\w*[\s_-]*(?:time|zeit)")  # of the whole recording
+_DURATION = re.compile(r"(?i)(?:record|log|acqui|mess)\w*[\s_-]*(?:time|zeit)")  # whole recording
 _RATE = re.compile(r"(?i)rate|freq|hz")
 _VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
 

@@ -25,6 +25,7 @@ from thermoctl.recording.foreign.dialect import (
     lines,
 )
 from thermoctl.recording.foreign.facts import stated_step
+from thermoctl.recording.foreign.hdf import read_hdf
 from thermoctl.recording.foreign.sheet import Cells, How, Sheet
 from thermoctl.recording.foreign.timing import table_of
 from thermoctl.recording.foreign.units import split_words
@@ -37,7 +38,7 @@ MAGIC = (
     (b"PK\x03\x04", "excel"),
     (b"PAR1", "parquet"),
     (b"ARROW1", "arrow"),
-    (b"\x89HDF", "mat"),
+    (b"\x89HDF", "hdf"),
     (b"MATLAB ", "mat"),
     (b"\xd0\xcf\x11\xe0", "xls"),
     (b"\x1f\x8b", "gzip"),
@@ -62,6 +63,8 @@ def kind_of(path: Path) -> str:
     if suffix in _SUFFIXES and (not head or suffix in (".arrow", ".arrows", ".feather")):
         return _SUFFIXES[suffix]
     found = next((kind for magic, kind in MAGIC if head.startswith(magic)), None)
+    if found == "hdf" and suffix == ".mat":
+        return "mat"
     return found or _SUFFIXES.get(suffix, "text")
 
 
@@ -125,6 +128,7 @@ def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
 
 
 _READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
+    "hdf": lambda path, how, notes: read_hdf(path, notes, how.sheet),
     "mdf": lambda path, how, notes: formats.read_mdf(path, notes),
     "tdms": lambda path, how, notes: formats.read_tdms(path, notes, how.sheet),
     "mat": lambda path, how, notes: formats.read_mat(path, notes, how.sheet),

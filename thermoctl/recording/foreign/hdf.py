@@ -1,0 +1,90 @@
+"""Read an HDF5 file: vectors and matrices of a group, tables of PyTables, data frames of pandas."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from thermoctl.extras import load
+from thermoctl.files.yamlfile import InputError, suggest
+from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.units import spelled
+
+
+def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[Sheet]:
+    """Return the named group of an HDF5 file, else that with most cells, as a table. Raises InputError."""
+    h5py = load("h5py", path)
+    sheets: dict[tuple[str, int], Sheet] = {}
+
+    def add(place: str, item: Any) -> None:
+        """Put a dataset into the table of its group; those of another length are another table."""
+        above, _, name = place.rpartition("/")
+        if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2) or len(item) < 2:  # noqa: PLR2004
+            return
+        if re.fullmatch(r"axis0|block\d+_items", name) or "_i_" in place:  # names of a data frame; an index
+            return
+        columns = _columns(name, item)
+        own = above if item.dtype.names is None else place
+        sheet = sheets.setdefault((own or "/", len(item)), Sheet({}, _row_of(path), name=own or "/"))
+        sheet.columns |= columns
+        if len(columns) == 1 and (
+            unit := spelled(_text(item.attrs.get("units", item.attrs.get("unit", ""))), name)
+        ):
+            sheet.units[name] = unit
+
+    try:
+        with h5py.File(path) as file:
+            file.visititems(add)
+    except (OSError, RuntimeError, ValueError, TypeError) as e:
+        raise InputError(f"{path}: not a whole HDF5 file: {str(e).splitlines()[0]}") from None
+    names = list(dict.fromkeys(s.name for s in sheets.values()))
+    if group is not None and group not in names:
+        raise InputError(f"{path}: no group '{group}'{suggest(group, names)}; it has {', '.join(names)}")
+    chosen = [s for s in sheets.values() if group in (None, s.name)]
+    chosen.sort(key=lambda s: len(s) * len(s.columns), reverse=True)
+    if len(chosen) > 1:
+        notes.append(
+            f"'{chosen[0].name}' read, {len(chosen[0])} rows, of {', '.join(names)} (another: --sheet GROUP)"
+        )
+    return chosen[:1]
+
+
+def _row_of(path: Path) -> Any:
+    return lambda row: f"{path}: row {row + 1}"
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _columns(name: str, item: Any) -> dict[str, Cells]:
+    """Return the columns of a dataset: of a matrix and of a table's field with several values one each."""
+    values = item[()]
+    if values.dtype.names is not None:
+        fields = {n: np.asarray(values[n]) for n in values.dtype.names}
+        return {k: c for n, v in fields.items() if v.ndim < 3 for k, c in _split(n, v, None).items()}  # noqa: PLR2004
+    titles = item.parent.get(name.replace("_values", "_items")) if name.startswith("block") else None
+    if name == "axis1" and _text(item.attrs.get("kind", "")).startswith("datetime64"):
+        values = values.astype("datetime64[ns]")
+    return _split("index" if name == "axis1" else name, values, titles)
+
+
+def _split(name: str, values: np.ndarray, titles: Any) -> dict[str, Cells]:
+    if values.ndim == 1:
+        return {name: _cells(values)}
+    own = (
+        [_text(t) for t in titles[()]]
+        if titles is not None
+        else [f"{name}_{k + 1}" for k in range(values.shape[1])]
+    )
+    return {n: _cells(c) for n, c in zip(own, values.T, strict=True)}
+
+
+def _cells(values: np.ndarray) -> Cells:
+    if values.dtype.kind in "iub":
+        return values.astype(float)
+    return values if values.dtype.kind in "fmM" else pa.array([_text(v) for v in values.tolist()])
