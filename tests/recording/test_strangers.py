@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import scipy.io
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.logger import joined, read_recording
@@ -273,3 +274,32 @@ def test_hdf5_of_other_programs(tmp_path):
     path.write_bytes(path.read_bytes()[:900])
     with pytest.raises(InputError, match="not a whole HDF5 file"):
         read_recording(path)
+
+
+@pytest.mark.parametrize("by_column", [True, False])
+def test_the_result_of_a_modelica_program(tmp_path, by_column):
+    def letters(*lines):
+        matrix = np.array([list(x.ljust(20)) for x in lines])
+        return ["".join(x) for x in (matrix.T if by_column else matrix)]
+
+    data = np.array([[0.0, 20.0], [0.5, 21.0], [0.5, 22.0], [1.0, 23.0], [1.0, 23.0]])
+    places = np.array([[0, 1, 0, -1], [2, 2, 0, -1], [1, 2, 0, 0], [2, -2, 0, -1]], float)
+    content = {
+        "Aclass": [
+            "Atrajectory",
+            "1.1        ",
+            "           ",
+            "binTrans   " if by_column else "binNormal  ",
+        ],
+        "name": letters("time", "block.T", "block.C", "loss[1]"),
+        "description": letters("Time in [s]", "Heat [degC|K]", "Capacity [J/K]", "Loss [W]"),
+        "dataInfo": places.T if by_column else places,
+        "data_1": np.array([[0.0, 1.0], [5.0, 5.0]]),
+        "data_2": data.T if by_column else data,
+    }
+    scipy.io.savemat(tmp_path / "dsres.mat", content, format="4")
+    found = read_recording(tmp_path / "dsres.mat")
+    assert found.t.tolist() == [0, 0.5, 1] and found.units == {"block.T": "degC", "loss[1]": "W"}
+    assert found.columns["block.T"].tolist() == [20, 22, 23]
+    assert found.columns["loss[1]"].tolist() == [-20, -22, -23]
+    assert any("2 rows before an event" in n for n in found.notes)

@@ -25,6 +25,7 @@ from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.clock import Seconds
 from thermoctl.recording.foreign.dialect import distinct
 from thermoctl.recording.foreign.facts import stated_step
+from thermoctl.recording.foreign.modelica import trajectories
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table
@@ -217,8 +218,8 @@ def _cell(value: object) -> str:
     return value.isoformat() if isinstance(value, date | time) else "" if value is None else str(value)
 
 
-def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[Sheet]:
-    """Read a MATLAB file, 4 to 7.3: tables, timetables, structs, vectors. Raises InputError."""
+def _loaded(path: Path) -> dict[str, Any]:
+    """Return the variables of a MATLAB file, by name. Raises InputError."""
     matio = load("matio", path)
     path.stat()
     try:
@@ -227,7 +228,14 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
             content = matio.load_from_mat(str(path))
     except Exception as e:  # any error on damaged bytes
         raise _damaged(path, "MATLAB", e) from None
-    content = {k: v for k, v in content.items() if not k.startswith("__")}
+    return {k: v for k, v in content.items() if not k.startswith("__")}
+
+
+def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[Sheet]:
+    """Read a MATLAB file, 4 to 7.3: tables, timetables, structs, vectors. Raises InputError."""
+    content = _loaded(path)
+    if (result := trajectories(content, notes)) is not None:
+        return [Sheet(result[0], _row_of(path), result[1])]
     step_s = _stated(content)
     if variable is not None:
         content = {variable: content[_chosen(path, variable, list(content), "variable")]}
