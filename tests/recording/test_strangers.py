@@ -303,3 +303,13 @@ def test_the_result_of_a_modelica_program(tmp_path, by_column):
     assert found.columns["block.T"].tolist() == [20, 22, 23]
     assert found.columns["loss[1]"].tolist() == [-20, -22, -23]
     assert any("2 rows before an event" in n for n in found.notes)
+
+
+def test_identities_of_digits_are_no_numbers(tmp_path):
+    found = read(tmp_path, rows("Cell ID,time,T", *(f"345626_9356111_33_{i},{i},2{i}" for i in range(4))))
+    assert list(found.columns) == ["T"] and any("left out: Cell ID" in n for n in found.notes)
+
+
+def test_units_of_flows_speeds_and_pressures(tmp_path):
+    text = rows("time,p,Speed (mph),Temp. Deg C", "s,atm,,", *(f"{i},1.{i},{i},2{i}" for i in range(5)))
+    assert read(tmp_path, text).units == {"p": "atm", "Speed": "mph", "Temp.": "degC"}

@@ -131,6 +131,9 @@ def numbers(
     if wrong.any():
         _refuse(name, tidy, wrong, int((right & ~empty).sum()))
         return None
+    body = parts.field("body")
+    if not any(pc.any(pc.match_substring_regex(body, p)).as_py() for p in _READINGS.values()):
+        return None  # identities such as 345_9356_33_6
     values = _valued(name, parts, empty, decimal)
     return _with_units(name, values, unit, empty, note)
 

@@ -278,7 +278,7 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
     (re.compile(r"\A(?:#(?:datatype|group|default)\b|,result,table\b)"), _annotated),
     (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
-    (re.compile(r"\A\"?Record Length\"?,"), _tektronix),
+    (re.compile(r"\A\W?\w?Record Length\"?,"), _tektronix),
     (re.compile(rf"\A{_LABELS.pattern}\s*$", re.MULTILINE), _labelled),
 )
 

@@ -17,14 +17,16 @@ WORDS: dict[str, Any] = yaml.load(
 """Words that loggers use, by kind."""
 # Symbols that make `(...)` behind a name a unit; square brackets always hold one.
 _SYMBOL = (
-    r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|mmHg|inHg|lbf|lb|kgf|ft|gallon|rpm|rps|kn|dBm|dB|"
+    r"(?:degC|degF|deg|%|°|rad|min|h|hr|d|ppm|ppb|bar|psi|mmHg|inHg|lbf|lb|kgf|ft|gallon|rpm|rps|kn|mph|atm|torr|dBm|dB|"
     r"(?:da|[fpnuµmcdhkMGT])?(?:m|g|s|A|K|V|W|J|N|Pa|Hz|Ω|ohm|F|H|C|T|Wh|l|L|mol|bar|VA|var|S|Nm|Ncm|eV|Wb|lx|rad|Ah))"
 )
 ANGLES = (), dimension("Hz")  # dimensions in which pint takes a radian for 1 and a turn for 2 pi
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
 _UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
-_LAST = re.compile(r"(.*[^\s,(\[/])\s+(°\s?[CF]|℃|℉)$|(CH\d+)([VA])$")  # `Temp. °C`; CH1V of an oscilloscope
+_LAST = re.compile(
+    r"(.*[^\s,(\[/])\s+(°\s?[CF]|℃|℉|[Dd]eg\.? ?[CF])$|(CH\d+)([VA])$"
+)  # `Temp. °C`; CH1V of an oscilloscope
 _SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
 
 
