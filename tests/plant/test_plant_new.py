@@ -323,6 +323,17 @@ def test_every_unit_of_an_angle_or_a_velocity_is_one(folder, unit, kind, factor)
     assert (size, plant.parameters["damping"].value) == pytest.approx((2.0, 6.0), rel=0.1)
 
 
+def test_columns_may_have_the_names_that_the_draft_uses(folder):
+    t = np.arange(0.0, 20.0, 0.02)
+    force, x = swung(t, 2.0, 6.0, 0.0)
+    rows = "\n".join(f"{a:g},{b:.5f},{c:.8g}" for a, b, c in zip(t, force, x[1], strict=True))
+    (folder / "a.csv").write_text(f"t,drive [Nm],speed [rad/s]\n{rows}\n")
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    plant = load("p.yaml")
+    (drive,), (speed,) = plant.inputs.values(), plant.outputs.values()
+    assert (drive.column, speed.column) == ("drive", "speed")
+
+
 def swing(t):
     """A mass of 1 on a spring of 40 N/m with 0.3 N*s/m, let go at 0.2 m; its rest is at 0.05 m."""
     w = (40 - 0.15**2) ** 0.5

@@ -83,11 +83,11 @@ def test_uneven_times_are_used_before_a_nominal_step(tmp_path):
 
 def test_units_behind_a_slash(tmp_path):
     text = rows(
-        "mode\tox/red\ttime/s\tEwe/V\tI/mA\tCapacity/mAh/g\tQ charge/discharge/mA.h",
-        *(f"1\t0\t{10 * i}\t3.{i}\t{i}\t{i}\t{i}" for i in range(4)),
+        "mode\tox/red\ttime/s\tEwe/V\tI/mA\tCapacity/mAh/g\tQ charge/discharge/mA.h\t(Q-Qo)/C",
+        *(f"1\t0\t{10 * i}\t3.{i}\t{i}\t{i}\t{i}\t{i}" for i in range(4)),
     )
     found = read(tmp_path, text)
-    units = {"Ewe": "V", "I": "mA", "Capacity": "mAh/g", "Q charge/discharge": "mA*h"}
+    units = {"Ewe": "V", "I": "mA", "Capacity": "mAh/g", "Q charge/discharge": "mA*h", "(Q-Qo)": "C"}
     assert found.units == units and {"mode", "ox/red"} < set(found.columns)
     assert found.t.tolist() == [0, 10, 20, 30]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -251,15 +251,15 @@ def quoted(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def identifiers(columns: Sequence[str]) -> dict[str, str]:
-    """Return a name of the plant language for each column."""
+def identifiers(columns: Sequence[str], taken: Collection[str] = ()) -> dict[str, str]:
+    """Return a name of the plant language for each column, none of them `taken`."""
     names: dict[str, str] = {}
     last = [re.split(r"[./]", c)[-1] for c in columns]  # sensor.room, Model/T: without what is above it
     for c, end in zip(columns, last, strict=True):
         c_short = end if re.match(r"\D", end) and last.count(end) == 1 else c
         name = re.sub(r"\W+", "_", _ascii(c_short.translate(_SPELLED)), flags=re.ASCII).strip("_") or "x"
         name = f"q_{name}" if name[0].isdigit() or name in ("t", "pi") else name
-        while name in names.values():
+        while name in names.values() or name in taken:
             name += "_2"
         names[c] = name
     return names

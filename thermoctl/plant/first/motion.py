@@ -25,6 +25,20 @@ TURNED = (
     1.2  # friction alone never turns a free motion: its path is at most so many times the way from end to end
 )
 SPRING = 0.25  # a spring is written where it lowers the squared error of the balance to this share
+OWN = [
+    "speed",
+    "place",
+    "mass",
+    "inertia",
+    "damping",
+    "stiffness",
+    "rest",
+    "K_drive",
+    "drive",
+    "friction",
+    "spring",
+    "travel",
+]
 DRIVES = ("force", "torque", "current", "voltage", "duty", "power")
 
 
@@ -35,7 +49,7 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     speed = next((c for c in sensors if c.kind in ("velocity", "turning")), None)
     moving = [c for c in (drive, place, speed) if c]
     turns = any(c.kind in ("angle", "turning", "torque") for c in moving)
-    ids = identifiers([c.name for c in moving])
+    ids = identifiers([c.name for c in moving], OWN)
     force, x, v = (c.values(table) if c else None for c in (drive, place, speed))
     sizes = _free(table.t, x, v) if force is None else _Sizes(*_sizes(table.t, force, x, v))
     by_force = drive is None or drive.kind in ("force", "torque")

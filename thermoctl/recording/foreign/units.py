@@ -34,7 +34,7 @@ def spelled(unit: str | None, name: str = "") -> str | None:
     """Return a unit as pint writes it: °C is degC, Volts is V; None where nothing is stated.
 
     C and F are degrees, but of a charge or a capacity."""
-    if unit in ("C", "F") and not re.search(r"(?i)charge|ladung|capa|kapa|^[qc]([_ 0-9]|$)", name):
+    if unit in ("C", "F") and not re.search(r"(?i)charge|ladung|capa|kapa|^[qc]([_ 0-9]|$)|\bd?q\b", name):
         return f"deg{unit}"
     unit = re.sub(r"\s+", " ", (unit or "").strip()).replace("μ", "µ")
     if unit.lower() in _SPELLED and unit not in ("Grad", "STD", "Std"):
