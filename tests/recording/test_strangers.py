@@ -4,6 +4,7 @@ from datetime import datetime, timedelta
 
 import h5py
 import numpy as np
+import openpyxl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -313,3 +314,22 @@ def test_identities_of_digits_are_no_numbers(tmp_path):
 def test_units_of_flows_speeds_and_pressures(tmp_path):
     text = rows("time,p,Speed (mph),Temp. Deg C", "s,atm,,", *(f"{i},1.{i},{i},2{i}" for i in range(5)))
     assert read(tmp_path, text).units == {"p": "atm", "Speed": "mph", "Temp.": "degC"}
+
+
+def test_a_sheet_with_times_is_read_before_one_with_a_counter(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.title = "Cycles"
+    for row in [["Cycle", "Q"], *([i, 2 + i % 2] for i in range(1, 9))]:
+        book.active.append(row)
+    counted = tmp_path / "cycles.xlsx"
+    book.save(counted)
+    records = book.create_sheet("Records")
+    for row in [["Time (s)", "U (V)"], *([i / 2, 3.5] for i in range(9))]:
+        records.append(row)
+    book.save(tmp_path / "both.xlsx")
+    trace = []
+    found = read_recording(tmp_path / "both.xlsx", trace=trace)
+    assert not any("Cycle'" in line for line in trace)
+    assert found.units == {"U": "V"} and any("sheet 'Records' read" in n for n in found.notes)
+    assert list(read_recording(tmp_path / "both.xlsx", sheet="Cycles").columns) == ["Q"]
+    assert list(read_recording(counted).columns) == ["Q"]

@@ -36,6 +36,7 @@ STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
 NEEDED = 30  # least points of a clock
 # Least points of a clock that is used though another column holds wrong dates, or is named as another.
 SURE = 60
+COUNTER_NOTE = "a counter, for want of times"
 COUNTER = 1.0  # step of a column that counts rows
 _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # A column without a name is the fraction of whole seconds if it makes the steps' spread EVENER times as
@@ -232,7 +233,7 @@ def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: 
         points += COUNTED  # the column only increases, as any signal may
     if kind == "bare":
         note = "its unit is assumed: s"
-        note = f"a counter, for want of times; {note} a step" if counter else note
+        note = f"{COUNTER_NOTE}; {note} a step" if counter else note
         seconds = replace(seconds, note="; ".join(filter(None, (seconds.note, note))))
     if counter and points > FOREIGN:
         points = NEEDED

@@ -15,6 +15,7 @@ import pyarrow.parquet
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording import files
 from thermoctl.recording.foreign import cells, clock, formats, layouts
+from thermoctl.recording.foreign.axis import COUNTER_NOTE
 from thermoctl.recording.foreign.dialect import (
     FACT,
     Dialect,
@@ -109,22 +110,31 @@ def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
 
 
 def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
-    """Return the named sheet of an Excel file, else the first that holds a table."""
+    """Return the named sheet of an Excel file, else the first table with times, else with a counter."""
     pages = formats.read_excel(path, how.sheet)
     first: InputError | None = None
+    found: list[tuple[bool, str, list[Sheet], list[str], list[str]]] = []
     for title, text in pages:
         try:
             here: list[str] = []
-            read_sheets = _text(path, text, how, here)
-            table_of(path, read_sheets, how, list(here))
+            tried = replace(how, trace=[])
+            sheets = _text(path, text, tried, here)
+            table = table_of(path, sheets, replace(how, trace=[]), list(here))
         except InputError as e:
             first = first or e
             continue
-        if len(pages) > 1:
-            notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
-        notes += here
-        return read_sheets
-    raise first or InputError(f"{path}: no rows; at least one sample was expected")
+        counted = any(COUNTER_NOTE in n for n in table.notes)
+        found.append((counted, title, sheets, here, tried.trace))
+        if not counted:
+            break
+    if not found:
+        raise first or InputError(f"{path}: no rows; at least one sample was expected")
+    _, title, sheets, here, trace = min(found, key=lambda f: f[0])
+    how.trace.extend(trace)
+    if len(pages) > 1:
+        notes.append(f"sheet '{title}' read, of {', '.join(t for t, _ in pages)} (another: --sheet NAME)")
+    notes += here
+    return sheets
 
 
 _READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
