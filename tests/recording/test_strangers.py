@@ -244,8 +244,13 @@ def test_parts_of_a_date_without_a_year(tmp_path):
     assert found.t.tolist() == [0, 3600, 7200, 10800] and "start" not in found.meta
 
 
-def test_each_line_in_quotes(tmp_path):
-    found = read(tmp_path, rows('"Date;T;P"', *(f'"01.03.2026 10:0{i}:00;2{i},5;{i}"' for i in range(4))))
+def test_lines_in_quotes(tmp_path):
+    found = read(
+        tmp_path,
+        rows(
+            "[Summary]", "Cell: 1", '"Date;T;P"', *(f'"01.03.2026 10:0{i}:00;2{i},5;{i}"' for i in range(4))
+        ),
+    )
     assert found.columns["T"].tolist() == [20.5, 21.5, 22.5, 23.5] and found.t[-1] == 180
 
 

@@ -154,9 +154,9 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
-    if len(_QUOTED.findall(text[:HEAD])) > 1 and len(_QUOTED.findall(text)) == text.strip().count(b"\n") + 1:
+    if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
-        notes.append("each line stands in quotes; read without them")
+        notes.append("whole lines stand in quotes; read without them")
     dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
     how.trace.append(f"read as: {_described(dialect)}")
     notes += dialect.notes
