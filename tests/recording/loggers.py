@@ -202,6 +202,18 @@ CASES = (
     Case("Onset HOBO", "hobo.csv", rows(
         '"Plot Title: block"\n"#","Date Time, GMT+01:00","Temp, °C (LGR S/N: 10, SEN S/N: 10)","Coupler Attached (LGR S/N: 10)"\n',
         "{i},03/01/26 10:00:{s} AM,{T}.0,", end="7,03/01/26 10:00:06 AM,,Logged\n"), {"Temp": [*RISING, np.nan]}, [*T6, 6], {"Temp": "degC"}),
+    Case("Lascar EL-USB", "lascar.txt", f"EL-USB-1,Time,Celsius(°C),Serial Number\n1,{DATE} 10:00:00,20.0,010012345\n"
+         + "".join(f"{i + 1},{DATE} 10:00:0{i},{20 + i}.0\n" for i in range(1, 6)), {"Celsius": RISING}, units={"Celsius": "degC"}),
+    Case("Testo Comfort", "testo.csv", rows('"Datum";"Uhrzeit";"°C [Kanal 1]"\n', '"01.03.2026";"10:00:{s}";"{T},0"').encode("cp1252"),
+         {"Kanal 1": RISING}, units={"Kanal 1": "degC"}),
+    Case("Hioki 8430, durations", "hioki.csv", rows("HIOKI 8430,Ver 1.00\nTime,CH1-1[V],CH1-2[°C]\n", "0 00:00:{s}.0,{P},{T}"),
+         {"CH1-1": POWER, "CH1-2": RISING}, units={"CH1-1": "V", "CH1-2": "degC"}),
+    Case("Bio-Logic EC-Lab", "ec.mpt", rows("EC-Lab ASCII FILE\nNb header lines : 4\n\nmode\ttime/s\tEwe/V\tI/mA\n", "3\t{i}.0E+000\t{T}\t{P}"),
+         {"Ewe": RISING, "I": POWER}, units={"Ewe": "V", "I": "mA"}),
+    Case("Victron VRM", "vrm.csv", rows("timestamp,System [0],Battery [1]\ntimezone,PV power,Voltage\nEurope/Berlin (+01:00),W,V\n",
+         DATE + " 10:00:{s},{P},{T}"), {"PV power": POWER, "Voltage": RISING}, units={"PV power": "W", "Voltage": "V"}),
+    Case("DWD, an hour a row", "produkt_tu.txt", rows("STATIONS_ID;MESS_DATUM;QN_9;TT_TU;eor\n", "         44;202603010{i};    3;  {T}.0;eor"),
+         {"TT_TU": RISING}, [3600.0 * i for i in range(6)]),
     Case("PicoLog 6", "picolog.csv", rows('"","TC08 Channel 1 Ave. (°C)","Power (W)"\n', DATE + "T10:00:{s}+01:00,{T}.0,{P}"),
          {"TC08 Channel 1 Ave.": RISING, "Power": POWER}),
     Case("PicoScope", "pico.csv", rows("Time,Channel A,Channel B\n(ms),(V),(mV)\n\n", "{k}.00000000,{T}.0,{P}"),
