@@ -174,6 +174,19 @@ def test_day_and_month_of_uneven_rows_past_midnight(tmp_path):
     np.testing.assert_allclose(found.t, np.cumsum([0, *steps]), atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "names, first", [("Date,Hour", 0), ("Date,Hour Ending", 1), ("date,time", 0), ("Datum,HH", 1)]
+)
+@pytest.mark.parametrize("form", ["%Y-%m-%d", "%d.%m.%Y", "%Y%m%d"])
+def test_a_date_and_its_hours(tmp_path, names, first, form):
+    stamps = [datetime(2026, 3, 1) + timedelta(hours=k) for k in range(40)]
+    body = [f"{s.strftime(form)},{s.hour + first},{20 + s.day}" for s in stamps]
+    found = read(tmp_path, rows(f"{names},T", *body))
+    np.testing.assert_allclose(found.t, 3600.0 * np.arange(40))
+    assert any("hours of the day" in n for n in found.notes)
+    assert str(found.meta["start"]).startswith(f"2026-03-01T0{first}:00")
+
+
 def test_the_error_names_texts_that_may_be_times(tmp_path):
     with pytest.raises(InputError, match="no time in a form that is known: 'when': 'W05-2026"):
         read(tmp_path, rows("when,T", *(f"W05-2026 t{i},{20 + i % 2}" for i in range(4))))

@@ -300,13 +300,16 @@ def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
 def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds]) -> Seconds | None:
     if of_day == date:
         return None
-    days, hours = sheet.columns[date], sheet.columns[of_day]
+    days, hours, said = sheet.columns[date], sheet.columns[of_day], ""
     if isinstance(hours, np.ndarray):
         digits = hours[np.isfinite(hours)] if hours.dtype.kind == "f" else np.zeros(0)
         plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
-        if not plain or digits.max() > 235_959 or named(of_day) <= 0:  # noqa: PLR2004
+        hourly = of_day.strip().lower() in _FIELDS["hour"]
+        if not plain or digits.max() > 235_959 or (named(of_day) <= 0 and not hourly):  # noqa: PLR2004
             return None
         long = digits.max() > 2359 or "hhmmss" in of_day.lower()  # noqa: PLR2004
+        if digits.max() <= 24 and "hhmm" not in of_day.lower():  # noqa: PLR2004
+            digits, long, said = digits * 10_000, True, " and hours of the day"
         hours = pa.array([f"{v:06.0f}" if long else f"{v:04.0f}00" for v in digits.tolist()])
         hours = pc.replace_substring_regex(hours, r"^(\d\d)(\d\d)(\d\d)$", r"\1:\2:\3")
     elif of_day not in read or read[of_day].kind != "time of day":
@@ -318,7 +321,8 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
             days = pa.array([f"{v:.0f}" for v in days.tolist()])
             days = pc.replace_substring_regex(days, r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3")
     try:
-        return clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
+        joined = clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
+        return replace(joined, note=joined.note + said)
     except (ClockError, pa.ArrowInvalid):
         return None
 

@@ -254,9 +254,8 @@ def from_texts(texts: pa.Array) -> Seconds:
         return Seconds((ns - ns[0]) / 1e9, None, note, "time of day")
     if not dated.all():
         raise ClockError(int(np.argmin(dated)), "a time without a date among dates")
-    halves = pc.any(pc.not_equal(field["p"], "")).as_py()
-    american = halves and not pc.match_substring_regex(tidy, r"^\d+\.\d+\.")[0].as_py()
-    ns, order = _dated(field, clock, american)
+    points = pc.match_substring_regex(tidy, r"^\d+\.\d+\.")[0].as_py()
+    ns, order = _dated(field, clock, points)
     timed = bool(pc.any(pc.not_equal(field["h"], "")).as_py())
     zone = field["z"][0].as_py()
     seconds = _since(
@@ -333,10 +332,10 @@ def _clock_ns(field: dict[str, pa.Array]) -> np.ndarray:
     return ((hour * 60 + minute - zone) * 60 + second) * 1_000_000_000 + fraction
 
 
-def _dated(field: dict[str, pa.Array], clock: np.ndarray, american: bool) -> tuple[np.ndarray, str]:
+def _dated(field: dict[str, pa.Array], clock: np.ndarray, points: bool) -> tuple[np.ndarray, str]:
     """Return nanoseconds since 1970, and the order of year, month and day.
 
-    `american`: the month is first where either can be."""
+    `points` between them: the month is not first."""
     middle = pc.utf8_lower(field["b"])
     named = [t for t in pc.unique(middle).to_pylist() if t.isalpha()]
     for text in named:
@@ -357,12 +356,15 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray, american: bool) -> tup
         if named:
             orders = {"day.month.year": (year, b, a)}
     by_order = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
+    if points and "day.month.year" in by_order:
+        by_order.pop("month/day/year", None)
     if not by_order:
         raise ClockError(0, "no date: a month of 1 to 12 and a day of 1 to 31 were expected")
     if "year/month/day" in by_order and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
         prefer = ["year/month/day", *orders]
     else:
-        prefer = ["month/day/year", *orders] if american else list(orders)
+        halves = pc.any(pc.not_equal(field["p"], "")).as_py()
+        prefer = ["month/day/year", *orders] if halves else list(orders)
     return _one_order(by_order, prefer)
 
 
