@@ -318,7 +318,7 @@ def test_an_amplifier_is_switched_off_over_a_link_of_its_own(made):
 
 DAC = f"""{HEAD}bus: modbus
 modbus: {{timeout_s: 0.05}}
-drive: {{unit: V, scale: 0.005, limits: [-5, 5], command_hz: 50, watchdog_s: none, state: assumed,
+drive: {{unit: V, scale: 0.005, limits: [0, 5], command_hz: 50, watchdog_s: none, state: assumed,
   command: {{register: 0, type: uint16, value: command}}, disable: []}}
 channels:
   out: {{kind: holding, register: 0, type: uint16, scale: 0.005, unit: V, range: [0, 10], rate_hz: 20, stale_after_s: 1}}
@@ -357,7 +357,13 @@ def test_a_dac_without_state_and_watchdog(tmp_path):
         ("watchdog_s: none, ", "", "'watchdog_s' is missing"),
         ("watchdog_s: none", "watchdog_s: 0.01", "below two periods of command_hz"),
         ("value: command", "value: 3", "does not carry the command"),
-        ("limits: [-5, 5]", "limits: [1, 5]", "must contain 0"),
+        ("limits: [0, 5]", "limits: [1, 5]", "must contain 0"),
+        (
+            "limits: [0, 5]",
+            "limits: [-5, 5]",
+            r"p\.yaml:7:\d+: command: -1000 does not fit uint16, 0 .. 65535 .'limits'",
+        ),
+        ("disable: []", "disable: [{register: 1, value: 70000}]", "disable: 70000 does not fit int16"),
         ("state: assumed", "state: {channel: outt, enabled: [1], disabled: [0]}", "did you mean 'out'"),
         ("disable: []", "disable: [{register: 1, value: 0, function: 5}]", "function: 5 cannot write"),
         ("  out:", "  state:", "name of the assumed state"),
@@ -454,6 +460,11 @@ def test_a_position_drive_starts_where_it_stands(tmp_path):
         ("0x6041, 0x6064]", "0x6041]", "needs 0x6064"),
         ("mode: 8", "mode: 1", "needs a handshake"),
         ("command: 0x607A", "command: 0x2071", "the type of object 0x2071 is not known"),
+        (
+            "limits: [500, 2000]",
+            "limits: [500, 3e7]",
+            r"50000 .. 3e\+09 counts, the command object holds -2147483647",
+        ),
     ],
 )
 def test_mistakes_in_a_position_drive_are_told(tmp_path, old, new, message):
@@ -463,6 +474,60 @@ def test_mistakes_in_a_position_drive_are_told(tmp_path, old, new, message):
     node = yamlfile.loads("{profile: p.yaml, port: 'slcan:x', roles: {state: amplifier_state}}")
     with pytest.raises(InputError, match=message):
         driver(bind(node, tmp_path))
+
+
+COMMAND_DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 5 Set: 8 A
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" A
+ SG_ Torque m0 : 8|16@1- (0.001,0) [0|0] "A" A
+ SG_ Level m0 : 24|8@1+ (1,%s) [0|0] "" A
+ SG_ Other m1 : 8|8@1+ (1,9) [0|0] "" A
+BO_ 6 Off: 8 A
+ SG_ Mode : 0|2@1+ (1,0) [0|0] "" A
+"""
+
+
+@pytest.mark.parametrize(
+    "offset,limits,values,off,message",
+    [
+        ("0", "[-32, 32]", "Torque: command", "Mode: 3", ""),
+        ("0", "[-33, 32]", "Torque: command", "Mode: 3", "command: Torque cannot be -33: it holds -32.768 .. 32.767"),
+        ("0", "[-32, 32]", "Torque: command, Page: 1", "Mode: 3", "Torque is not sent: Page selects it"),
+        ("0", "[-32, 32]", "Torque: command, Page: 16", "Mode: 3", "Page cannot be 16: it holds 0 .. 15"),
+        ("5", "[-32, 32]", "Torque: command", "Mode: 3", "Level cannot be 0: it holds 5 .. 260; give its value in 'val"),
+        ("5", "[-32, 32]", "Torque: command, Level: 5", "Mode: 3", ""),
+        ("0", "[-32, 32]", "Torque: command", "Mode: 4", "disable: Mode cannot be 4: it holds 0 .. 3$"),
+    ],
+)  # fmt: skip
+def test_a_can_message_must_hold_its_numbers(tmp_path, offset, limits, values, off, message):
+    """A number that does not fit would end the tick; the message that disables would never be sent."""
+    (tmp_path / "a.dbc").write_text(COMMAND_DBC % offset)
+    (tmp_path / "p.yaml").write_text(
+        f"{HEAD}bus: can-dbc\ndbc: a.dbc\ndrive: {{unit: A, scale: 1, limits: {limits}, watchdog_s: 1, state: assumed,\n"
+        f"  command: {{message: Set, values: {{{values}}}}}, disable: [{{message: Off, values: {{{off}}}}}]}}\n"
+        "channels: {x: {message: Off, signal: Mode, unit: '1', rate_hz: 10, stale_after_s: 1}}\n"
+    )
+    if not message:
+        load_profile(tmp_path / "p.yaml")
+        return
+    with pytest.raises(InputError, match=rf"p\.yaml:\d+:\d+: .*{message}"):
+        load_profile(tmp_path / "p.yaml")
+
+
+@pytest.mark.parametrize("kind,value", [("int16", 40000), ("uint8", -1), ("digits4", 10000), ("hex2", 256)])
+def test_a_binary_message_must_hold_its_numbers(tmp_path, kind, value):
+    (tmp_path / "p.yaml").write_text(
+        f"{HEAD}bus: serial-binary\nframe: {{sync: [1], crc: none, fields: [{{name: a, type: int16}}]}}\n"
+        "drive: {unit: A, scale: 1, limits: [-1, 1], watchdog_s: 1, state: assumed,\n"
+        "  command: {crc: none, fields: [{type: int8, value: command}]},\n"
+        f"  disable: [{{crc: none, fields: [{{type: {kind}, value: {value}}}]}}]}}\n"
+        "channels: {x: {field: a, unit: '1', rate_hz: 10, stale_after_s: 1}}\n"
+    )
+    with pytest.raises(InputError, match=r"p\.yaml:8:\d+: disable: "):
+        load_profile(tmp_path / "p.yaml")
 
 
 def test_a_drive_that_takes_can_fd_frames(tmp_path):

@@ -101,6 +101,7 @@ def test_a_comment_of_several_lines_is_no_message(tmp_path, fault):
         (GOOD + GOOD.replace("801", "802"), V, "2 messages have this name .0x321, 0x322."),
         (GOOD.replace("801", "1075054137"), V, "has more than 29 bits"),
         (GOOD.replace("(0.01,0)", "(x,0)"), V, "no signal of the format"),
+        (GOOD.replace("(0.01,0)", "(0,0)"), V, "signal: .*a.dbc: Volts has the factor 0"),
         (GOOD.replace(" T :", " Volts :"), V, "a second signal of this name"),
         (GOOD, V.replace("Volts", "Vols"), "'Vols' is not one of Volts, T .did you mean 'Volts'"),
     ],

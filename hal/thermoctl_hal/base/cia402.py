@@ -17,11 +17,12 @@ Which of these steps a drive takes, and when, is decided by its driver: can/driv
 from __future__ import annotations
 
 import re
+import struct
 
-from thermoctl.files.yamlfile import Node, integer_of, kind_of
+from thermoctl.files.yamlfile import InputError, Node, integer_of, kind_of
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, AMP_QUICK_STOP
-from thermoctl_hal.base.key import REQUIRED, Key
-from thermoctl_hal.base.profile import FIELD_TYPES, Object
+from thermoctl_hal.base.key import REQUIRED, Key, whole_range
+from thermoctl_hal.base.profile import FIELD_TYPES, Amplifier, Object
 
 MAX_STEP_S = 0.01  # longest time for which a position target moves in one write
 FAULT_RESET_S = 1.0  # time between attempts to reset a drive's fault while `enable` is False
@@ -61,6 +62,20 @@ START_UP: tuple[Key, ...] = (
     Key("value", "integer", "the number written", REQUIRED, "", -(2**31), 2**32, example="2500"),
 )
 """Keys of an object that is written at set-up."""
+
+
+def largest_command(letter: str, amplifier: Amplifier, place: str) -> int:
+    """Return the largest count of a command with this letter of `struct`.
+
+    Raises InputError where `limits` are larger."""
+    largest = whole_range(8 * struct.calcsize("<" + letter), True)[1]
+    low, high = amplifier.counts
+    if max(-low, high) > largest:
+        raise InputError(
+            f"{place}: drive: 'limits' / 'scale' is {low:g} .. {high:g} counts, the command object holds "
+            f"{-largest} .. {largest}: check both"
+        )
+    return largest
 
 
 def drive_state(status_word: int) -> float:

@@ -39,6 +39,11 @@ def bits_of(of: str) -> tuple[Key, ...]:
     )
 
 
+def whole_range(bits: int, is_signed: bool) -> tuple[int, int]:
+    """Return the least and the largest whole number of so many bits."""
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+
+
 def sentinel_of(node: Node, bits: int, is_signed: bool, letter: str = "") -> float:
     """Return a sentinel as the raw number that it is read as. letter: f, d of a float type, else ''.
 
@@ -52,7 +57,7 @@ def sentinel_of(node: Node, bits: int, is_signed: bool, letter: str = "") -> flo
             return float(struct.unpack(f">{letter}", whole or struct.pack(f">{letter}", value))[0])
         except OverflowError:
             raise node.error(f"sentinels: {value:g} is no float of {bits} bits") from None
-    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+    low, high = whole_range(bits, is_signed)
     if is_text and high < value < 1 << bits:
         return float(value - (1 << bits))
     if low <= value <= high and value == int(value):

@@ -3,8 +3,21 @@
 from __future__ import annotations
 
 import re
+import struct
+from collections.abc import Iterable
 
-from thermoctl_hal.base.profile import CanMessage, Dbc, FrameMessage, Message, Register, TextMessage
+from thermoctl_hal.base.key import whole_range
+from thermoctl_hal.base.profile import (
+    BusSpec,
+    CanMessage,
+    Dbc,
+    FrameMessage,
+    Message,
+    Register,
+    RegisterMessage,
+    TextMessage,
+    typed,
+)
 from thermoctl_hal.base.wire import Framer
 
 _ADDRESS = re.compile(rb"\{address(:[^{}]*)?\}")
@@ -41,17 +54,64 @@ def can_frame(message: Message, spec: Dbc, command: float, address: int) -> tupl
     if not isinstance(message, CanMessage):
         raise TypeError(f"{type(message).__name__} is no CAN message")
     definition = spec.database.get_message_by_name(message.name)
-    values = {s.name: 0.0 for s in definition.signals}
-    values |= {name: command if value is None else value for name, value in message.values.items()}
+    values = _values(message, (s.name for s in definition.signals), command)
     return spec.can_id(message.name, address), bytes(definition.encode(values, strict=False))
+
+
+def _values(message: CanMessage, signals: Iterable[str], command: float) -> dict[str, float]:
+    given = {name: command if value is None else value for name, value in message.values.items()}
+    return dict.fromkeys(signals, 0.0) | given
 
 
 def clipped(value: float, register: Register) -> float:
     """Return a number inside the range of a register's type, rounded for whole types."""
     if register.type.startswith("float"):
         return value
-    bits = 16 * register.words
-    low, high = (
-        (0, 2**bits - 1) if register.type.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-    )
+    low, high = whole_range(16 * register.words, not register.type.startswith("u"))
     return float(min(max(round(value), low), high))
+
+
+def misfit(message: Message, spec: BusSpec, command: float) -> str:
+    """Return why a message cannot carry its numbers, '' where it can. command: counts."""
+    try:
+        if isinstance(message, RegisterMessage):
+            value = command if message.value is None else message.value
+            if message.register.type != "bit" and abs(clipped(value, message.register) - value) > 0.5:
+                low, high = whole_range(16 * message.register.words, message.register.type[0] != "u")
+                return f"{value:g} does not fit {message.register.type}, {low} .. {high}"
+        elif isinstance(message, FrameMessage):
+            zeros = FrameMessage(message.frame, (0.0,) * len(message.values))
+            if len(serial_bytes(message, command, 0)) != len(serial_bytes(zeros, 0.0, 0)):
+                return "a number has more digits than its field"
+        elif isinstance(message, CanMessage):
+            return _misfit_of_signals(message, typed(spec, Dbc), command)
+    except (ArithmeticError, ValueError, struct.error) as e:
+        return f"a number does not fit its field: {e}"
+    return ""
+
+
+def _misfit_of_signals(message: CanMessage, spec: Dbc, command: float) -> str:
+    signals = {s.name: s for s in spec.database.get_message_by_name(message.name).signals}
+    values = _values(message, signals, command)
+
+    def raw(name: str) -> float:
+        return float((values[name] - signals[name].offset) / signals[name].scale)
+
+    def is_sent(name: str) -> bool:
+        ids, by = signals[name].multiplexer_ids, signals[name].multiplexer_signal
+        return not ids or by is None or (is_sent(by) and round(raw(by)) in ids)
+
+    for name, s in signals.items():
+        if not is_sent(name):
+            if name in message.values:
+                return f"{name} is not sent: {s.multiplexer_signal} selects it: give its number in 'values'"
+            continue
+        if not s.scale:
+            return f"{name} has the factor 0 in the DBC file"
+        low, high = whole_range(s.length, s.is_signed)
+        if not s.is_float and not low - 0.5 <= raw(name) <= high + 0.5:
+            first, last = sorted(x * s.scale + s.offset for x in (low, high))
+            return f"{name} cannot be {values[name]:g}: it holds {first:g} .. {last:g}" + (
+                "" if name in message.values else "; give its value in 'values'"
+            )
+    return ""

@@ -367,6 +367,11 @@ class Amplifier:
     fault: str = ""
     watchdog_s: float | None = None
 
+    @property
+    def counts(self) -> tuple[float, float]:
+        """Return `limits` as counts."""
+        return self.limits[0] / self.scale, self.limits[1] / self.scale
+
 
 @dataclass(frozen=True)
 class Assumed:

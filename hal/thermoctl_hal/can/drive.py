@@ -23,7 +23,14 @@ from array import array
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
-from thermoctl_hal.base.cia402 import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word, state_name
+from thermoctl_hal.base.cia402 import (
+    FAULT_RESET_S,
+    MAX_STEP_S,
+    drive_state,
+    largest_command,
+    next_control_word,
+    state_name,
+)
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ACTUAL_POSITION, POSITION_MODES, STATUS_WORD, Cia402, Object, typed
 from thermoctl_hal.base.wire import nearest
@@ -61,7 +68,7 @@ class Cia402Device(Device):
         self._shift = array("i", [8 * sum(sizes[:k]) for k in range(len(sizes))])
         self._bits = array("i", [8 * size for size in sizes])
         self._signed = array("i", [f.islower() for f in formats])
-        self._command_limit = 2 ** (8 * struct.calcsize(command) - 1) - 1
+        self._command_limit = 0
         sources = [typed(b.channel.source, Object) for b in binding.bounds]
         amplifier = binding.profile.amplifier
         if amplifier is not None and STATUS_WORD not in sources:
@@ -74,6 +81,7 @@ class Cia402Device(Device):
         self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
         self._master = spec.master_id
         if amplifier is not None:
+            self._command_limit = largest_command(command, amplifier, binding.profile.file)
             (self._low, self._high), self._scale = amplifier.limits, amplifier.scale
             self._slew = amplifier.slew_per_s / amplifier.scale
         self._actual = spec.transmit.index(ACTUAL_POSITION) if spec.mode in POSITION_MODES else -1

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.cia402 import OBJECT_TYPES, START_UP, read_object_name
-from thermoctl_hal.base.key import named, sentinel_of, take
+from thermoctl_hal.base.key import named, sentinel_of, take, whole_range
 from thermoctl_hal.base.profile import (
     ERROR_CODE,
     STATUS_WORD,
@@ -75,7 +75,10 @@ def _signal_of(s: Section, spec: Dbc, message: str) -> Signal:
     if fault is not None:
         raise s.get("signal").error(f"signal: {spec.file}: {fault}")
     definition = spec.database.get_message_by_name(message)
-    return definition.get_signal_by_name(named(s, "signal", [x.name for x in definition.signals]))
+    signal = definition.get_signal_by_name(named(s, "signal", [x.name for x in definition.signals]))
+    if not signal.scale:
+        raise s.get("signal").error(f"signal: {spec.file}: {signal.name} has the factor 0")
+    return signal
 
 
 def _raw_sentinel(node: Node, signal: Signal) -> float:
@@ -89,7 +92,7 @@ def _raw_sentinel(node: Node, signal: Signal) -> float:
     if signal.is_float:
         return float((value - signal.offset) / signal.scale)
     bits = signal.length
-    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    low, high = whole_range(bits, signal.is_signed)
     exact = (value - signal.offset) / signal.scale
     for raw in (exact, value):
         nearest = round(raw)

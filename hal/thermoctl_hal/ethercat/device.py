@@ -20,7 +20,13 @@ from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
-from thermoctl_hal.base.cia402 import FAULT_RESET_S, MAX_STEP_S, drive_state, next_control_word
+from thermoctl_hal.base.cia402 import (
+    FAULT_RESET_S,
+    MAX_STEP_S,
+    drive_state,
+    largest_command,
+    next_control_word,
+)
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ACTUAL_POSITION, POSITION_MODES, Amplifier, typed
 from thermoctl_hal.ethercat.bus import EthercatBus, bus_of
@@ -44,7 +50,7 @@ class EthercatDevice(Device):
         self._bus = EthercatBus(binding.port)
         self._drive: Cia402Steps | None = None
         if binding.profile.amplifier is not None and spec.command is not None:
-            self._drive = Cia402Steps(spec, binding.profile.amplifier)
+            self._drive = Cia402Steps(spec, binding.profile.amplifier, binding.profile.file)
             states = [p.offset == 0 and p.letter == "H" and not p.bits[1] for p in self._places]
             if True not in states:
                 raise InputError(
@@ -127,12 +133,12 @@ class EthercatDevice(Device):
 class Cia402Steps:
     """The outputs of a drive: control word and command. The rules are those of thermoctl_hal.can.drive."""
 
-    def __init__(self, spec: Ethercat, amplifier: Amplifier) -> None:
+    def __init__(self, spec: Ethercat, amplifier: Amplifier, place: str) -> None:
         if spec.command is None:
             raise TypeError("a profile with 'command' was expected")
         self._amplifier, self._letter = amplifier, spec.command[1]
         self.size = 2 + struct.calcsize("<" + self._letter)
-        self._most = 2 ** (8 * (self.size - 2) - 1) - 1
+        self._most = largest_command(self._letter, amplifier, place)
         self._actual: Place | None = None
         if spec.mode in POSITION_MODES:
             items = list(spec.transmit)

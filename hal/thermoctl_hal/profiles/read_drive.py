@@ -7,6 +7,7 @@ from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, integer_of, number_of
 from thermoctl_hal.base.key import named, take
+from thermoctl_hal.base.message import misfit
 from thermoctl_hal.base.profile import (
     ACTUAL_POSITION,
     FRAME_TYPES,
@@ -52,7 +53,7 @@ def read_amplifier(top: Section, spec: BusSpec, channels: dict[str, Channel]) ->
         _check_mode(s, spec, k)
         more: dict[str, Any] = {"watchdog_s": spec.watchdog_s}
     else:
-        more = _by_messages(s, spec, channels)
+        more = _by_messages(s, spec, channels, [limit / k["scale"] for limit in k["limits"]])
     low, high = k["limits"]
     is_position = isinstance(spec, Cia402 | Ethercat) and spec.mode in POSITION_MODES
     if not low <= 0.0 <= high and not is_position:
@@ -82,20 +83,22 @@ def _check_mode(s: Section, spec: Cia402 | Ethercat, k: dict[str, Any]) -> None:
         )
 
 
-def _by_messages(s: Section, spec: BusSpec, channels: dict[str, Channel]) -> dict[str, Any]:
+def _by_messages(
+    s: Section, spec: BusSpec, channels: dict[str, Channel], counts: list[float]
+) -> dict[str, Any]:
     if s.get("watchdog_s", False) is None:
         raise s.node.error(
             "drive: 'watchdog_s' is missing: the time after which the device stops by itself when our messages "
             "stop, as it is set in the device; none when it cannot"
         )
     k = take(s, TABLES["drive by messages"])
-    command = read_message(k["command"], spec, "command")
+    command = _fitting(k["command"], spec, "command", *counts)
     if not carries_command(command):
         raise k["command"].error(
             "command: this message does not carry the command: put 'command' where it belongs"
         )
     messages: dict[str, Any] = {
-        key: tuple(read_message(n, spec, key) for n in k[key] or ())
+        key: tuple(_fitting(n, spec, key) for n in k[key] or ())
         for key in ("set_up", "enable", "disable", "reset")
     }
     state = None
@@ -124,6 +127,16 @@ def _by_messages(s: Section, spec: BusSpec, channels: dict[str, Channel]) -> dic
         "fault": fault,
         "watchdog_s": watchdog_s,
     }
+
+
+def _fitting(node: Node, spec: BusSpec, key: str, *counts: float) -> Message:
+    """Return the message of a node; it must carry its numbers, and commands of 0 and of `counts`."""
+    message = read_message(node, spec, key)
+    for command in (0.0, *counts):
+        if why := misfit(message, spec, command):
+            limits = f" ('limits' / 'scale' is {counts[0]:g} .. {counts[1]:g} counts)" if command else ""
+            raise node.error(f"{key}: {why}{limits}")
+    return message
 
 
 def carries_command(message: Message) -> bool:
