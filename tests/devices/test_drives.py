@@ -488,6 +488,12 @@ BO_ 5 Set: 8 A
 BO_ 6 Off: 8 A
  SG_ Mode : 0|2@1+ (1,0) [0|0] "" A
 """
+CAN_DRIVE = f"""{HEAD}bus: can-dbc
+dbc: a.dbc
+drive: {{unit: A, scale: 1, limits: %s, watchdog_s: 1, state: assumed,
+  command: {{message: Set, values: {{%s}}}}, disable: [{{message: Off, values: {{%s}}}}]}}
+channels: {{x: {{message: Off, signal: Mode, unit: '1', rate_hz: 10, stale_after_s: 1}}}}
+"""
 
 
 @pytest.mark.parametrize(
@@ -505,15 +511,31 @@ BO_ 6 Off: 8 A
 def test_a_can_message_must_hold_its_numbers(tmp_path, offset, limits, values, off, message):
     """A number that does not fit would end the tick; the message that disables would never be sent."""
     (tmp_path / "a.dbc").write_text(COMMAND_DBC % offset)
-    (tmp_path / "p.yaml").write_text(
-        f"{HEAD}bus: can-dbc\ndbc: a.dbc\ndrive: {{unit: A, scale: 1, limits: {limits}, watchdog_s: 1, state: assumed,\n"
-        f"  command: {{message: Set, values: {{{values}}}}}, disable: [{{message: Off, values: {{{off}}}}}]}}\n"
-        "channels: {x: {message: Off, signal: Mode, unit: '1', rate_hz: 10, stale_after_s: 1}}\n"
-    )
+    (tmp_path / "p.yaml").write_text(CAN_DRIVE % (limits, values, off))
     if not message:
         load_profile(tmp_path / "p.yaml")
         return
     with pytest.raises(InputError, match=rf"p\.yaml:\d+:\d+: .*{message}"):
+        load_profile(tmp_path / "p.yaml")
+
+
+@pytest.mark.parametrize(
+    "old,new,message",
+    [
+        ("unit: A", "unit: mA", "unit: the DBC file gives Torque in A, the profile says mA with scale 1"),
+        (
+            "scale: 1,",
+            "scale: 0.001,",
+            "Torque in A with its factor 0.001, which would count twice; say scale: 1",
+        ),
+    ],
+)
+def test_a_can_command_has_the_unit_of_the_file(tmp_path, old, new, message):
+    """A thousand times the wanted command, or a thousandth."""
+    (tmp_path / "a.dbc").write_text(COMMAND_DBC % "0")
+    text = CAN_DRIVE % ("[-0.01, 0.01]", "Torque: command", "Mode: 3")
+    (tmp_path / "p.yaml").write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=rf"p\.yaml:6:\d+: .*{message}"):
         load_profile(tmp_path / "p.yaml")
 
 

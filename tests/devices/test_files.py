@@ -149,6 +149,27 @@ def test_spellings_of_units(theirs, ours):
     assert dbc_unit(theirs) == ours
 
 
+def test_a_factor_of_the_file_counts_once(tmp_path):
+    with pytest.raises(
+        InputError, match="scale: the DBC file gives Volts in V with its factor 0.01, .* say scale: 1"
+    ):
+        device(tmp_path, START + GOOD, [V + ", scale: 0.01"], "{v: voltage_v}")
+    for scale in ("1.02", "0.5"):  # a calibration, a divider
+        device(tmp_path, START + GOOD, [V + f", scale: {scale}"], "{v: voltage_v}")
+
+
+@pytest.mark.parametrize("first,second", [(801, 801), (0x98FEEEFE, 0x8CFEEEFE)])
+def test_two_messages_of_one_identifier_are_told(tmp_path, first, second):
+    """A signal of the second one would be read by the layout of the first one."""
+    other = GOOD.replace("801 READING", f"{second} OTHER").replace("16|8@1+ (1,", "24|8@1+ (2,")
+    dbc = START + GOOD.replace("801", str(first)) + other
+    with pytest.raises(
+        InputError, match=r"yaml:\d+:\d+: message: OTHER and READING have the same identifier"
+    ):
+        device(tmp_path, dbc, [V, T.replace("READING", "OTHER")])
+    device(tmp_path, dbc, [V, T])
+
+
 def test_kelvin_with_an_offset_is_celsius(tmp_path):
     device(tmp_path, START + GOOD, [T.replace("degC", "K") + ", offset: 273.15"], "{t: air_c}")
 

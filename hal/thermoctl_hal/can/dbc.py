@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.amplifier import Commanded
 from thermoctl_hal.base.backend import HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
@@ -46,6 +47,12 @@ class DbcDevice(Device):
             if spec.is_j1939(source.message, binding.address):
                 can_id = pgn_of(can_id)
             entry = self._messages.setdefault(can_id, (message, [], []))
+            if entry[0] is not message:
+                raise InputError(
+                    f"{b.channel.place}: message: {message.name} and {entry[0].name} have the same identifier, "
+                    f"{_shown(can_id)}: a frame cannot tell them apart; give this channel a device of its own in "
+                    "the rig file (of J1939 with its 'address')"
+                )
             entry[1].append((i, source))
             if source.invalid is not None:
                 entry[2].append(source.invalid.field)

@@ -20,6 +20,7 @@ from thermoctl_hal.base.profile import (
     object_name,
     typed,
 )
+from thermoctl_hal.base.units import dbc_unit, is_convertible
 from thermoctl_hal.can.dbc_file import load_dbc
 from thermoctl_hal.can.keys import CAN
 
@@ -79,6 +80,25 @@ def _signal_of(s: Section, spec: Dbc, message: str) -> Signal:
     if not signal.scale:
         raise s.get("signal").error(f"signal: {spec.file}: {signal.name} has the factor 0")
     return signal
+
+
+def check_unit(
+    s: Section, spec: Dbc, message: str, name: str, unit: str, scale: float, offset: float = 0.0
+) -> None:
+    """Raise where `unit` and `scale` of a channel or command contradict the DBC file's unit and factor."""
+    signal = spec.database.get_message_by_name(message).get_signal_by_name(name)
+    theirs = dbc_unit(signal.unit)
+    if theirs == unit and scale == signal.scale != 1.0:
+        raise s.get("scale").error(
+            f"scale: the DBC file gives {name} in {signal.unit} with its factor {signal.scale:g}, which would "
+            "count twice; say scale: 1"
+        )
+    kelvin = {theirs, unit} == {"degC", "K"} and abs(offset) > 0.0
+    if theirs != unit and abs(scale) == 1.0 and is_convertible(theirs) and not kelvin:
+        raise s.get("unit").error(
+            f"unit: the DBC file gives {name} in {signal.unit}, the profile says {unit} "
+            f"with scale 1; say unit: {theirs}, or the scale from {signal.unit} to {unit}"
+        )
 
 
 def _raw_sentinel(node: Node, signal: Signal) -> float:

@@ -10,7 +10,7 @@ from thermoctl.files.yamlfile import Section
 from thermoctl_hal.base.key import take
 from thermoctl_hal.base.profile import Assumed, BusSpec, Channel, Dbc, DbcSource, Profile, Source, typed
 from thermoctl_hal.base.text_file import while_same
-from thermoctl_hal.base.units import dbc_unit, is_convertible
+from thermoctl_hal.can.read import check_unit
 from thermoctl_hal.profiles.buses import BUSES, part
 from thermoctl_hal.profiles.keys import PROFILE
 from thermoctl_hal.profiles.read_drive import read_amplifier
@@ -66,22 +66,10 @@ def _channel(name: str, s: Section, spec: BusSpec, read_source: _ReadSource) -> 
         name, k["unit"], k["scale"], k["offset"], k["range"], rate, stale, read_source(s, spec), s.node.place
     )
     if isinstance(spec, Dbc):
-        _check_dbc_unit(s, spec, channel)
+        source = typed(channel.source, DbcSource)
+        check_unit(s, spec, source.message, source.signal, channel.unit, channel.scale, channel.offset)
     s.end()
     return channel
-
-
-def _check_dbc_unit(s: Section, spec: Dbc, channel: Channel) -> None:
-    """Raise where the DBC file's unit is not the profile's and no scale converts between them."""
-    source = typed(channel.source, DbcSource)
-    signal = spec.database.get_message_by_name(source.message).get_signal_by_name(source.signal)
-    theirs = dbc_unit(signal.unit)
-    kelvin = {theirs, channel.unit} == {"degC", "K"} and abs(channel.offset) > 0.0
-    if theirs != channel.unit and abs(channel.scale) == 1.0 and is_convertible(theirs) and not kelvin:
-        raise s.get("unit").error(
-            f"unit: the DBC file gives {signal.name} in {signal.unit}, the profile says {channel.unit} "
-            f"with scale 1; say unit: {theirs}, or the scale from {signal.unit} to {channel.unit}"
-        )
 
 
 _ReadSource = Callable[[Section, BusSpec], Source]

@@ -28,8 +28,9 @@ from thermoctl_hal.base.profile import (
     TextLine,
     TextMessage,
     object_name,
+    typed,
 )
-from thermoctl_hal.can.read import message_of
+from thermoctl_hal.can.read import check_unit, message_of
 from thermoctl_hal.ethercat.read import Ethercat
 from thermoctl_hal.profiles.keys import TABLES
 from thermoctl_hal.serial.read import bytes_of, checksum_name
@@ -54,6 +55,10 @@ def read_amplifier(top: Section, spec: BusSpec, channels: dict[str, Channel]) ->
         more: dict[str, Any] = {"watchdog_s": spec.watchdog_s}
     else:
         more = _by_messages(s, spec, channels, [limit / k["scale"] for limit in k["limits"]])
+    if isinstance(spec, Dbc):
+        command = typed(more["command"], CanMessage)
+        for name in (n for n, value in command.values.items() if value is None):
+            check_unit(s, spec, command.name, name, k["unit"], k["scale"])
     low, high = k["limits"]
     is_position = isinstance(spec, Cia402 | Ethercat) and spec.mode in POSITION_MODES
     if not low <= 0.0 <= high and not is_position:
