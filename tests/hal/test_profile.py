@@ -107,19 +107,22 @@ def test_a_damaged_profile_is_read_or_refused_never_a_traceback(tmp_path_factory
 @pytest.mark.parametrize(
     "text,message",
     [
-        ("{profile: none.yaml, port: x, roles: {}}", "none.yaml cannot be read"),
+        ("{profile: none.yaml, port: /dev/x, roles: {}}", "none.yaml cannot be read"),
         ("{profile: encoder-serial.yaml, roles: {position: position_um}}", "'port' is missing"),
-        ("{profile: encoder-serial.yaml, port: x, roles: {positon: position_um}}", "did you mean 'position'"),
         (
-            "{profile: encoder-serial.yaml, port: x, roles: {position: position}}",
+            "{profile: encoder-serial.yaml, port: /dev/x, roles: {positon: position_um}}",
+            "did you mean 'position'",
+        ),
+        (
+            "{profile: encoder-serial.yaml, port: /dev/x, roles: {position: position}}",
             "did you mean 'position_um'",
         ),
         (
-            "{profile: encoder-serial.yaml, port: x, roles: {position: coil_c}}",
+            "{profile: encoder-serial.yaml, port: /dev/x, roles: {position: coil_c}}",
             "the role coil_c takes degC or K",
         ),
         (
-            "{profile: encoder-serial.yaml, prot: x, port: x, roles: {position: position_um}}",
+            "{profile: encoder-serial.yaml, prot: x, port: /dev/x, roles: {position: position_um}}",
             "unknown key 'prot'",
         ),
     ],
@@ -146,14 +149,35 @@ def test_a_binding_may_loosen_the_limits_of_its_profile():
     with pytest.raises(InputError, match="has none"):
         bind(
             yamlfile.loads(
-                "{profile: encoder-serial.yaml, port: x, watchdog_s: 1, roles: {position: position_um}}"
+                "{profile: encoder-serial.yaml, port: /dev/x, watchdog_s: 1, roles: {position: position_um}}"
             ),
             CONFIG / "devices",
         )
 
 
+@pytest.mark.parametrize(
+    "profile,port",
+    [
+        ("encoder-serial.yaml", "ttyUSB0"),
+        ("encoder-serial.yaml", "socket://box"),
+        ("meter-can.yaml", "/dev/ttyACM0"),
+        ("meter-can.yaml", "socketcan:can0@500k"),
+        ("meter-can.yaml", "slcan:/dev/ttyACM0@0"),
+        ("drive-cia402.yaml", "can0"),
+        ("meter-modbus.yaml", "/dev/ttyUSB0"),
+        ("meter-modbus.yaml", "tcp:10.0.0.5"),
+        ("meter-modbus.yaml", "tcp:10.0.0.5:modbus"),
+    ],
+)
+def test_a_port_of_another_bus_is_refused(profile, port):
+    """`check` says it, not the first connection; a bitrate that is no number would count as part of the name."""
+    node = yamlfile.loads(f"{{profile: {profile}, port: '{port}', roles: {{}}}}")
+    with pytest.raises(InputError, match=rf"<text>:1:\d+: port: '{port}' is no port of a .* was expected"):
+        bind(node, CONFIG / "devices")
+
+
 def test_two_devices_in_one_role_are_refused():
-    text = "{{name: {0}, profile: encoder-serial.yaml, port: {0}, roles: {{position: position_um}}}}"
+    text = "{{name: {0}, profile: encoder-serial.yaml, port: /dev/{0}, roles: {{position: position_um}}}}"
     two = [bind(yamlfile.loads(text.format(n)), CONFIG / "devices") for n in "ab"]
     with pytest.raises(InputError, match="'position_um' is given by b and by a"):
         check_rig(two)
@@ -167,7 +191,7 @@ def test_units_convert_into_the_role(tmp_path):
             "unit: nm, scale: 5, offset: 100, range: [-5000000, 5000000]",
         )
     )
-    node = yamlfile.loads("{profile: e.yaml, port: x, roles: {position: position_um}}")
+    node = yamlfile.loads("{profile: e.yaml, port: /dev/x, roles: {position: position_um}}")
     bound = bind(node, tmp_path).bounds[0]
     assert bound.scale == pytest.approx(0.005) and bound.offset == pytest.approx(0.1)
     assert bound.high == pytest.approx(5000)

@@ -18,6 +18,7 @@ from thermoctl_hal.base.units import role_units
 from thermoctl_hal.can.eds import read_eds
 from thermoctl_hal.ethercat.read import LONGEST_WATCHDOG_S, Ethercat
 from thermoctl_hal.modbus.read import register_hint
+from thermoctl_hal.profiles.buses import BUSES
 from thermoctl_hal.profiles.read import load_profile
 
 LAST_ON_A_LINE, LAST_ON_TCP = 247, 255  # units of Modbus; a gateway's own is 255
@@ -70,11 +71,22 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
         for key in ("watchdog_s", "master_id"):
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")
-    port = resolve_port(s.text("port"), folder)
+    port = _port(s, profile, folder)
     name = s.text("name", profile.model)
     axis = _axis(s, bounds, channels) if profile.amplifier is not None else ""
     s.end()
     return Binding(name, profile, port, address, bounds, node.place, channels, axis=axis)
+
+
+def _port(s: Section, profile: Profile, folder: Path) -> str:
+    """Return the port. Raises InputError where the profile's bus has no such port."""
+    text = s.text("port")
+    pattern, words = BUSES[profile.bus].ports
+    if not re.fullmatch(pattern, text):
+        raise s.get("port").error(
+            f"port: '{text}' is no port of a {profile.bus} device; {words} was expected"
+        )
+    return resolve_port(text, folder)
 
 
 def _axis(s: Section, bounds: Iterable[Bound], channels: Channels) -> str:

@@ -20,7 +20,19 @@ class Bus(NamedTuple):
     section: str = ""  # name of the bus's section in a profile; '': its keys are keys of the profile
     table: str = ""  # table of the section's keys in profiles/keys.py
     has_line: bool = False  # a profile may have the settings of a serial line
+    ports: tuple[str, str] = (".*", "")  # pattern of a port, and how it is written
 
+
+_HOST = r"(\[[^]]+\]|[^:/]+):\d+/?"
+_SERIAL = (rf"\.{{0,2}}/.+|socket://{_HOST}", "/dev/serial/by-id/... or socket://host:port")
+_CAN = (
+    r"\w+:[^@]+(@[1-9]\d*(,\d+)?)?",
+    "interface:channel@bitrate with the bitrate in bit/s, as slcan:/dev/ttyACM0@500000 or socketcan:can0@500000",
+)
+_MODBUS = (
+    rf"tcp:{_HOST}|rtu:(\.{{0,2}}/.+|socket://{_HOST})",
+    "tcp:host:port, rtu:/dev/serial/by-id/... or rtu:socket://host:port",
+)
 
 BUSES = {
     "serial-binary": Bus(
@@ -31,6 +43,7 @@ BUSES = {
         "frame",
         "frame",
         True,
+        ports=_SERIAL,
     ),
     "serial-lines": Bus(
         "thermoctl_hal.serial.read:read_text",
@@ -40,6 +53,7 @@ BUSES = {
         "text",
         "text",
         True,
+        ports=_SERIAL,
     ),
     "can-dbc": Bus(
         "thermoctl_hal.can.read:read_dbc",
@@ -47,6 +61,7 @@ BUSES = {
         "thermoctl_hal.can.dbc:DbcDevice",
         "thermoctl_hal.can.dbc:DbcDrive",
         table="can-dbc",
+        ports=_CAN,
     ),
     "can-cia402": Bus(
         "thermoctl_hal.can.read:read_cia402",
@@ -54,6 +69,7 @@ BUSES = {
         "thermoctl_hal.can.drive:Cia402Device",
         section="cia402",
         table="cia402",
+        ports=_CAN,
     ),
     "modbus": Bus(
         "thermoctl_hal.modbus.read:read_modbus",
@@ -63,6 +79,7 @@ BUSES = {
         "modbus",
         "modbus",
         True,
+        ports=_MODBUS,
     ),
     "ethercat": Bus(
         "thermoctl_hal.ethercat.read:read_ethercat",
