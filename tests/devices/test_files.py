@@ -209,6 +209,22 @@ def test_a_short_frame_gives_the_signals_that_it_has(tmp_path, size):
     assert "READING came with 1 of 8 bytes" in dev.silence()
 
 
+def test_a_page_that_the_file_does_not_describe_gives_the_signals_of_every_page(tmp_path):
+    dbc = GOOD.replace(" SG_ Volts : 0", ' SG_ Page M : 32|8@1+ (1,0) [0|0] "" H\n SG_ Volts : 0').replace(
+        "T :", "T m1 :"
+    )
+    dev = device(tmp_path, START + dbc, [V, T])
+    sample = read(dev, (801, bytes.fromhex("d2043c0001000000")), (801, bytes.fromhex("d3043d0007000000")))
+    assert sample.value[ROLE["voltage_v"]] == pytest.approx(12.35) and dev.counts["errors"] == 0
+    assert sample.value[ROLE["air_c"]] == pytest.approx(20)
+    dev = device(tmp_path, START + dbc, [T], "{t: air_c}")
+    read(dev, (801, bytes.fromhex("d3043d0007000000")))
+    assert (
+        "1 frames came and gave no reading: READING came with Page 7, a page without the signal"
+        in dev.silence()
+    )
+
+
 J1939 = 'BO_ 2566844158 ET1: 8 DEV\n SG_ T : 0|8@1+ (1,-40) [0|0] "deg C" HOST\n'
 ET1 = "t: {message: ET1, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1, sentinels: [215]"
 

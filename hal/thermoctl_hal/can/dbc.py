@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, cast
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.amplifier import Commanded
@@ -118,20 +119,16 @@ class DbcDevice(Device):
                 )
             return
         try:
-            values: Mapping[str, Any] = entry[0].decode_simple(data, False, True, True)
+            values = _decoded(entry[0], data, True)
             readings = [(i, s, float(values[s.signal])) for i, s in entry[1] if s.signal in values]
-            raws: Mapping[str, Any] = entry[0].decode_simple(data, False, False, True) if entry[2] else {}
+            raws = _decoded(entry[0], data, False) if entry[2] else {}
         except Exception as e:  # foreign bytes may raise anything in the library
             self.counts["errors"] += 1
             self._quiet += 1
             self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
             return
-        if not readings and len(data) < entry[0].length:
-            self.counts["errors"] += 1
-            self._quiet += 1
-            self._why = (
-                f"{entry[0].name} came with {len(data)} of {entry[0].length} bytes, without the signal"
-            )
+        if not readings:
+            self._without_signal(entry[0], data, values)
             return
         self.counts["frames"] += 1
         for i, source, value in readings:
@@ -145,6 +142,17 @@ class DbcDevice(Device):
                 )
             else:
                 self.put(sample, i, value, now_s)
+
+    def _without_signal(self, message: DbcMessage, data: bytes, values: Mapping[str, Any]) -> None:
+        """Note a frame without any signal of the profile: it is short, or of another page."""
+        self._quiet += 1
+        if len(data) < message.length:
+            self.counts["errors"] += 1
+            self._why = f"{message.name} came with {len(data)} of {message.length} bytes, without the signal"
+            return
+        self.counts["frames"] += 1
+        pages = ", ".join(f"{s.name} {values.get(s.name)}" for s in message.signals if s.is_multiplexer)
+        self._why = f"{message.name} came with {pages}, a page without the signal"
 
     def silence(self) -> str:
         """Say what arrives instead of a reading."""
@@ -161,6 +169,24 @@ class DbcDevice(Device):
         if self._port is not None:
             self.counts["ignored"] = self._port.ignored + self._fd_ignored
         return self.counts
+
+
+def _decoded(message: DbcMessage, data: bytes, scaling: bool) -> Mapping[str, Any]:
+    """Return the signals of a frame; of a page that the file does not describe, those of every page."""
+    try:
+        found: Any = message.decode_simple(data, False, scaling, True)
+    except Exception:  # foreign bytes may raise anything in the library
+        if not message.is_multiplexed():
+            raise
+        found = _every_page(message).decode_simple(data, False, scaling, True)
+    return cast(Mapping[str, Any], found)
+
+
+@lru_cache(maxsize=64)
+def _every_page(message: DbcMessage) -> DbcMessage:
+    """Return a multiplexed message without the signals of single pages."""
+    signals = [s for s in message.signals if not s.multiplexer_ids]
+    return type(message)(message.frame_id, message.name, message.length, signals, strict=False)
 
 
 def _shown(can_id: int) -> str:
