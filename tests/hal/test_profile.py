@@ -235,3 +235,20 @@ def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
         "no output_reference_um (second encoder)",
         "no air_c",
     ]
+
+
+@pytest.mark.parametrize("limit,is_told", [(2.5, False), (15, True)])
+def test_check_says_that_a_drive_takes_less_than_output_limit(tmp_path, capsys, limit, is_told):
+    """The controller would wait for commands that the drive cuts off; drive_saturated compares with output_limit."""
+    from thermoctl.daemon.offline.doctor import check
+
+    (tmp_path / "rig.yaml").write_text(
+        f"rig: {{name: driven}}\ncontrol: {{kp: 0.01, ti_s: 0.004, td_s: 0.001, output_limit: {limit}}}\n"
+        "protection: {required: [amplifier_state]}\nhal:\n  backend: devices\n  devices:\n"
+        f"    - {{name: amp, profile: {CONFIG}/devices/drive-cia402.yaml, port: 'slcan:/dev/x', "
+        "roles: {state: amplifier_state}}\n"
+        f"socket: {{path: {tmp_path}/rig.sock}}\nrecording: {{directory: {tmp_path}}}\n"
+    )
+    assert check(load_settings(tmp_path / "rig.yaml")) == 0
+    told = "control.output_limit is 15, but amp takes commands of -2.5 .. 2.5 (drive.limits)"
+    assert (told in capsys.readouterr().out) == is_told

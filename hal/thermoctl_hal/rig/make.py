@@ -118,7 +118,16 @@ def _bindings(settings: Settings) -> list[Binding]:
 
 def device_notes(settings: Settings) -> list[str]:
     """Return a line for each probable mistake in `hal.devices`. Raises InputError."""
-    return rig_notes(_bindings(settings))
+    bindings = _bindings(settings)
+    limit = settings.control.output_limit
+    return rig_notes(bindings) + [
+        f"{b.place}: control.output_limit is {limit:g}, but {b.name} takes commands of {low:g} .. {high:g} "
+        "(drive.limits): the rest is cut off, and drive_saturated does not see it; lower output_limit"
+        for b in bindings
+        if b.profile.amplifier
+        for low, high in (b.profile.amplifier.limits,)
+        if limit > max(-low, high)
+    ]
 
 
 def device_warnings(settings: Settings) -> list[str]:
