@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # loading cantools takes a second
 
 EXTENDED, LONGEST_11, LONGEST_29 = 0x8000_0000, 0x7FF, 0x1FFF_FFFF
 NO_MESSAGE = "VECTOR__INDEPENDENT_SIG_MSG"  # pseudo-message that holds signals without a message
+NO_MESSAGES = "no message (a line 'BO_ number NAME: bytes sender') is in it"
 _BLOCK = re.compile(r"\s*BO_\s+(0[xX][0-9A-Fa-f]+|\d+)\s+([^\s:][^:]*?)\s*:\s*(\d+)\s*(\S*)")
 _BEGINS_BLOCK = re.compile(r"\s*BO_\s")
 _TEXT = re.compile(r"\s*(?:CM_|BA_\w*)\s")  # statements whose text may go on over several lines
@@ -93,6 +94,8 @@ def load_dbc(path: Path) -> DbcFile:
         if database is None
         else DbcFile(database, _doubled(m for m in database.messages))
     )
+    if not (blocks.database.messages or blocks.faults):
+        raise ValueError(NO_MESSAGES)
     if _J1939.search(text) and "VFrameFormat" not in text:
         for message in blocks.database.messages:
             message.protocol = "j1939"
@@ -120,7 +123,7 @@ def _by_message(path: Path, text: str, reason: str) -> DbcFile:
 
     blocks, attributes, remarks = _blocks(text)
     if not blocks:
-        raise ValueError(reason)
+        raise ValueError(f"{NO_MESSAGES}; {reason}")
     messages: list[Message] = []
     faults: dict[str, str] = {}
     for block in blocks:

@@ -78,7 +78,10 @@ def read_eds(path: Path) -> Eds:
     """Read an EDS file. Raises OSError; ValueError where it has no object."""
     entries, remarks = _sections(read_text(path).split("\n"))
     if not entries:
-        raise ValueError("it has no section of an object, as [6041]")
+        raise ValueError(
+            "it has no section of an object, as [6041]; of an XDD or ESI file (XML) the maker's tool saves an EDS "
+            "file, or give the types of the objects as 'objects'"
+        )
     _add_compact(entries)
     remarks += _odd(entries)
     remarks.sort()
