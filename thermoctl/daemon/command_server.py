@@ -269,9 +269,15 @@ def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
 
     Raises InputError where it cannot be made.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.suppress(FileNotFoundError):
-        path.unlink()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_socket():
+            raise InputError(
+                f"{path}: a file that is no socket is there, and is kept; give another socket.path"
+            )
+        path.unlink(missing_ok=True)
+    except OSError as e:
+        raise InputError(f"{path}: cannot listen: {e.strerror}; check socket.path") from None
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)
     try:
