@@ -237,6 +237,21 @@ def test_check_says_what_is_allowed_and_yet_unusual(tmp_path, capsys):
     ]
 
 
+@pytest.mark.parametrize(
+    "number,message",
+    [
+        (400001, "where the manual calls it 400001, it is kind: holding, register: 0$"),
+        (365536, "kind: input, register: 65535$"),
+        (465537, "is outside 0 .. 65535"),
+        (70000, "is outside 0 .. 65535"),
+    ],
+)
+def test_register_numbers_of_six_digits_are_explained(tmp_path, number, message):
+    (tmp_path / "module.yaml").write_text(MODULE.replace("register: 0,", f"register: {number},"))
+    with pytest.raises(InputError, match=rf"module\.yaml:\d+:\d+: register: .*{message}"):
+        load_profile(tmp_path / "module.yaml")
+
+
 @pytest.mark.parametrize("limit,is_told", [(2.5, False), (15, True)])
 def test_check_says_that_a_drive_takes_less_than_output_limit(tmp_path, capsys, limit, is_told):
     """The controller would wait for commands that the drive cuts off; drive_saturated compares with output_limit."""

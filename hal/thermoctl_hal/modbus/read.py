@@ -22,9 +22,14 @@ from thermoctl_hal.modbus.keys import MODBUS
 
 REGISTERS = 65536  # addresses of a Modbus unit
 _WORD_BITS = 8 * WORD_BYTES
-_MANUAL_BASES = ((30001, "input"), (40001, "holding"))
-_MANUAL_REGISTERS = 9999
-"""Manuals often number input registers 30001..39999 and holding registers 40001..49999, from address 0."""
+_MANUAL_BASES = (
+    (30001, 9999, "input"),
+    (40001, 9999, "holding"),
+    (300001, 65536, "input"),
+    (400001, 65536, "holding"),
+)
+"""Manuals often number input registers 30001..39999 and holding registers 40001..49999, from address 0: first
+number, how many, kind; with six digits all of them."""
 
 
 def read_modbus(top: Section, folder: Path) -> Modbus:
@@ -37,6 +42,9 @@ def read_modbus(top: Section, folder: Path) -> Modbus:
 
 def read_register(s: Section, spec: BusSpec) -> Register:
     """Read the place of a channel of a Modbus device: registers, a coil or a discrete input."""
+    given = s.get("register")
+    if isinstance(given.value, int) and given.value >= REGISTERS and (hint := register_hint(given.value)):
+        raise given.error(f"register: {hint}")
     k = take(s, MODBUS["channel of modbus"])
     invalid = _invalid(k["invalid"])
     exponent = None if k["scale_register"] is None else Register(k["kind"], k["scale_register"])
@@ -105,8 +113,8 @@ def _invalid(s: Section | None) -> tuple[Register, Condition] | None:
 
 def register_hint(address: int) -> str:
     """Return the kind and address meant by a manual that counts registers from 30001 or 40001, else ''."""
-    for base, kind in _MANUAL_BASES:
-        if base <= address < base + _MANUAL_REGISTERS:
+    for base, count, kind in _MANUAL_BASES:
+        if base <= address < base + count:
             return (
                 f"addresses count from 0; where the manual calls it {address}, it is kind: {kind}, "
                 f"register: {address - base}"
