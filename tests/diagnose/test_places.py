@@ -71,6 +71,14 @@ def test_a_reading_of_growth_may_follow_the_air_as_a_temperature_does(motor):
     assert set(offered(*motor, "cold_junction_drift")) == {"winding_c", "housing_c", "error"}
 
 
+def test_an_effect_that_the_plant_file_holds_already_comes_a_second_time_under_names_of_its_own(motor):
+    plant, table = motor
+    extended = offered(plant, table, "heat_split")["winding-housing"].extend({"A": 0.1})
+    again = offered(extended, table, "heat_split")["winding-housing"]
+    assert not again.own_in(extended)
+    assert extended.parameters.items() <= again.extend({"A": 0.2}).parameters.items()
+
+
 def test_a_period_that_has_not_come_twice_is_not_offered():
     plant = loads(FREE_CARRIAGE)
     t = np.arange(4000) * 0.002

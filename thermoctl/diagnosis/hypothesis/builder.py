@@ -43,8 +43,11 @@ class Candidate:
 
     @property
     def in_plant(self) -> str:
-        """Return effect and place as one name of the plant."""
-        return f"{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
+        """Return effect and place as one name, another one where the plant holds such an effect already."""
+        label = f"{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"
+        while any(f"{p.name}_{label}" in self.rig.plant.parameters for p in self.effect.parameters):
+            label += "_2"
+        return label
 
     def own(self, parameter: str) -> str:
         """Return the name in the plant of one of the effect's parameters, or of a node that it adds."""
