@@ -114,6 +114,31 @@ def test_the_reasons_of_a_folder_without_a_diagnosis_are_refused(tmp_path, capsy
     assert capsys.readouterr().out.rstrip("\n") == explain(FOUND)
 
 
+def test_a_name_that_is_no_effect_is_an_error_and_not_an_effect_that_promised_nothing(tmp_path, capsys):
+    (tmp_path / "diagnosis.json").write_text(json.dumps(FOUND))
+    assert main(["diagnose", "--explain", str(tmp_path), "--why", "radation at block"]) == 2
+    assert "'radation' is no effect of the catalogue (did you mean 'radiation'?)" in capsys.readouterr().err
+    assert main(["diagnose", "--explain", str(tmp_path), "--why", "sensor delay"]) == 0
+    assert "it promised nothing" in capsys.readouterr().out
+
+
+def test_the_columns_of_the_reasons_stay_apart():
+    h = {"log_evidence": 626.4, "log_prior_odds": -15.1, "posterior": 0.99, "remainder": 1.0}
+    text = explain(
+        FOUND | {"hypotheses": [h | {"effects": ["creep at v", "a at b"], "physics": [0.73, 1.0]}]}
+    )
+    row = next(line for line in text.splitlines() if "creep at v + a at b" in line)
+    cells = [cell.strip() for cell in row.split("  ") if cell.strip()]
+    assert cells == ["626.4", "-15.1", "0.99", "0.73, above 0.99", "above 0.99", "creep at v + a at b"]
+
+
+def test_an_extended_plant_that_held_out_data_contradict_is_not_recommended():
+    fit = FOUND["fit"] | {"held_out_after": {"reading": 18.1}}
+    assert "it rises from 3.4 K to 18.1 K" in words(FOUND | {"fit": fit})
+    assert "Do not predict with the extended plant yet: it misses reading" in words(FOUND | {"fit": fit})
+    assert "Use the extended plant" in words(FOUND)
+
+
 def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
     assert main(["diagnose", "run.csv", "--out", str(tmp_path)]) == 2
     assert "--plant FILE is missing" in capsys.readouterr().err
@@ -129,6 +154,8 @@ def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
             "sensor_lag at reading: a finding, probability 0.98; that other data confirm it above 0.99",
         ),
         ("creep", "creep at v: refitted, and it or a part of it is not significant"),
+        ("sensor lag", "sensor_lag at reading: a finding"),
+        ("sensor lag at reading", "sensor_lag at reading: a finding"),
         ("creep at w", "creep at w: it promised nothing in any screening"),
         ("cogging", "cogging at v: not refitted; to first order it gains at most 1.2 nats"),
     ],

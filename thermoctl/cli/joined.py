@@ -75,7 +75,7 @@ def diagnose(args: argparse.Namespace) -> int:
     if args.explain:
         from thermoctl.diagnosis.show import explained
 
-        return explained(args.explain, args.why)
+        return explained(args.explain, args.why, args.effects or ())
     for value, option in ((args.plant, "--plant FILE"), (args.out, "--out DIR")):
         if not value:
             plant = None if args.plant else next((r for r in args.recordings if r.endswith(".yaml")), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,25 @@ from rich.console import Console
 from rich.table import Table
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.report.explain import explain, why
+from thermoctl.diagnosis.report.explain import NOWHERE, explain, why
 from thermoctl.files.yamlfile import InputError, suggest
 
 
-def explained(folder: str, effect: str | None = None) -> int:
-    """Print the reasons of a diagnosis, or those of one effect. Raises InputError where there is none."""
+def explained(folder: str, effect: str | None = None, own: Sequence[str] = ()) -> int:
+    """Print the reasons of a diagnosis, or those of one effect. `own`: further folders of effect files.
+
+    Raises InputError where there is none, and for a name that is no effect."""
     result = read(Path(folder))
-    print(why(result, effect) if effect else explain(result))
+    answer = why(result, effect) if effect else explain(result)
+    if effect and answer.endswith(NOWHERE):
+        known = catalogue((CATALOGUE, CATALOGUE.parent / "mistakes", *map(Path, own)))
+        asked = effect.partition(" at ")[0].replace(" ", "_")
+        if asked not in known:
+            raise InputError(
+                f"'{asked}' is no effect of the catalogue{suggest(asked, known)}, and the diagnosis in {folder} "
+                "fitted none of this name; `thermoctl effects` lists them"
+            )
+    print(answer)
     return 0
 
 

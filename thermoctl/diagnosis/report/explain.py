@@ -8,6 +8,9 @@ from typing import Any
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import what_next
 
+NOWHERE = (
+    ": it promised nothing in any screening, or has no place in this plant (`thermoctl effects` lists names)"
+)
 SHOWN, LOST = 4, 3  # largest number of hypotheses; largest number of effects that were tried and lost
 
 
@@ -16,7 +19,9 @@ def explain(result: Mapping[str, Any]) -> str:
     lines = [f"verdict: {result['verdict']}, because {result['decision']['row']}"]
     lines += [f"    {value:>10}  {meaning}" for meaning, value in figures.decision_rows(result)[1]]
     heads, rows = figures.hypothesis_rows(result)
-    lines += ["".join(f"{cell:>16}" for cell in row[1:]) + f"  {row[0]}" for row in (heads, *rows[:SHOWN])]
+    table = (heads, *rows[:SHOWN])
+    widths = [max(16, 2 + max(map(len, column))) for column in zip(*table, strict=True)][1:]
+    lines += ["".join(map(str.rjust, row[1:], widths)) + f"  {row[0]}" for row in table]
     lost = "; ".join(
         f"{row[0]} ({row[1]})" for row in figures.lost_rows(result)[1][: min(LOST, len(result["lost"]))]
     )
@@ -28,11 +33,15 @@ def explain(result: Mapping[str, Any]) -> str:
 
 
 def why(result: Mapping[str, Any], asked: str) -> str:
-    """Return in one line why an effect, `NAME` or `NAME at PLACE`, is or is not a finding."""
+    """Return in one line why an effect, `NAME` or `NAME at PLACE`, is or is not a finding.
+
+    A name may be written as the reports print it, with blanks."""
+    spoken = asked.replace("_", " ")
 
     def is_asked(entry: str) -> bool:
         """Return whether an `effect at place` is the one that was asked for."""
-        return asked in (entry, entry.partition(" at ")[0])
+        plain = entry.replace("_", " ")
+        return spoken in (plain, plain.partition(" at ")[0])
 
     for f in result["findings"]:
         if is_asked(name := f"{f['effect']} at {f['where']}"):
@@ -53,4 +62,4 @@ def why(result: Mapping[str, Any], asked: str) -> str:
     if promised:
         name = max(promised, key=lambda n: promised[n])
         return f"{name}: not refitted; to first order it gains at most {promised[name]:.1f} nats, others promised more"
-    return f"{asked}: it promised nothing in any screening, or has no place in this plant (`thermoctl effects` lists names)"
+    return f"{asked}{NOWHERE}"

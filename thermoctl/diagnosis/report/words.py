@@ -19,9 +19,14 @@ NEXT = {
     "unexplained": "Look for the cause where and when the remainder is largest. Once it is known, add it to the catalogue "
     "(--effects DIR) and diagnose again.",
 }
+WORSE = (
+    "Do not predict with the extended plant yet: it misses {} by more than the refitted plant does, on data that took no part. "
+    "Record more, with wider steps, and diagnose again."
+)
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
 LIKELY = 0.05  # least probability of an effect that is mentioned with the verdict `consistent`
+CLEARLY = 1.5  # least held-out error, extended over refitted, that speaks against the extended plant
 LARGER = 1.1  # least error over the noise that is stated with the verdict `consistent`
 NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 
@@ -56,6 +61,8 @@ def what_next(result: Result) -> str:
         text = PERHAPS
     elif result["verdict"] in ("unexplained", "partly_explained") and _small(outputs(result)):
         text = f"Use the extended plant. {SMALL}" if result["findings"] else SMALL
+    if result["verdict"] in ("explained", "partly_explained") and (worse := _worse(outputs(result))):
+        text = WORSE.format(listed(worse))
     if result["truncated"]:
         text += " The budget of refits ended the search: more effects may be hidden."
     return text
@@ -84,7 +91,7 @@ def law_sentence(entry: Result | None) -> str:
     if not entry:
         return ""
     values = ", ".join(
-        f"{n} = {with_interval(p['value'], p['sd'])} {p['unit'] or ''}".strip()
+        f"{n} = {with_interval(p['value'], p['sd'])} {p['unit'] or ''}".removesuffix(" 1").strip()
         for n, p in entry["parameters"].items()
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
@@ -103,6 +110,12 @@ def _likely(result: Result) -> list[Result]:
 def _small(rows: Sequence[Output]) -> bool:
     """Return whether no remainder exceeds its noise or the step of its readings."""
     return bool(rows) and all(o.hidden for o in rows)
+
+
+def _worse(rows: Sequence[Output]) -> list[str]:
+    """Return the outputs that the extended plant predicts clearly worse than the refitted one."""
+    errors = ((o.name, o.errors["held_out_refit_only"], o.errors["held_out_after"]) for o in rows)
+    return [o for o, alone, extended in errors if alone and extended and extended > CLEARLY * alone]
 
 
 def _found(result: Result, rows: Sequence[Output]) -> str:
