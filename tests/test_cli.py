@@ -30,6 +30,11 @@ def test_the_help_lists_every_command_once_below_its_purpose(capsys):
     assert max(map(len, text.splitlines())) <= 120
 
 
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "thermoctl", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith("thermoctl ")
+
+
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
