@@ -135,6 +135,11 @@ def test_templates_are_the_shipped_files_and_the_help_names_them(capsys):
             "t,T [degC],b\n0,1,3\n1,2,3\n",
             "tells what 'b' is (from 3 to 3)",
         ),
+        (
+            ["--from-csv", "a.csv"],
+            "t,P [W],T\n0,1,\n1,2,\n",
+            "none is known in 'P' [W] (power), 'T' (no values); take",
+        ),
         (["--template", "blok"], "", "did you mean 'block'"),
         (["--from-csv", "a.csv"], "t,x [m],b\n0,1,1\n1,2,2\n", "recognised as what moves it"),
         (["--from-csv", "a.csv"], "t,T [degC],b\n0,1,1\n1,2,2\n", "'b [W]', or none: --inputs ''"),
@@ -170,6 +175,20 @@ def test_columns_without_units_are_named_by_hand(folder, capsys):
     values = {n: p.value for n, p in plant.parameters.items()}
     assert values["G_body_q_2nd_probe"] == pytest.approx(20 / 30, rel=0.05)
     assert values["C_body_q_2nd_probe"] == pytest.approx(200 * 20 / 30, rel=0.05)
+
+
+@pytest.mark.parametrize(("unit", "full"), [("%", 1.0), ("1", 100.0)])
+def test_an_input_that_is_named_in_percent_or_as_a_number_is_a_duty(folder, capsys, unit, full):
+    t = np.arange(0.0, 9.0, 0.03)
+    turning = 300 * (1 - np.exp(-t / 0.4))
+    rows = "\n".join(f"{a:g},{60 if a else 0},{b:.4f}" for a, b in zip(t, turning, strict=True))
+    (folder / "a.csv").write_text(f"t,leftCommand,leftSpeed\n{rows}\n")
+    named = ["--inputs", f"leftCommand [{unit}]", "--outputs", "leftSpeed [rpm]"]
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *named]) == 0
+    (folder / "p.yaml").write_text((folder / "p.yaml").read_text().replace('"?"', "1"))
+    values = {n: p.value for n, p in load("p.yaml").parameters.items()}
+    assert values["inertia"] / values["damping"] == pytest.approx(0.4, rel=0.2)
+    assert values["damping"] == pytest.approx(0.6 * full / (300 * np.pi / 30), rel=0.2)
 
 
 HEATED = (  # drive, air, body in the words of loggers in many languages, none with a unit

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError, suggest
@@ -164,8 +167,9 @@ def _outputs(
 
 def _no_output(table: Table, columns: Sequence[Column]) -> InputError:
     """Return the error that no first plant starts from these columns: asks for a unit where one lacks."""
-    shown = ", ".join(f"'{c.name}'{_taken(c)}" for c in columns)
-    bare = next((c.name for c in columns if not c.unit or c.doubt), None)
+    empty = {c.name for c in columns if not np.isfinite(table.columns[c.name]).any()}
+    shown = ", ".join(f"'{c.name}'{' (no values)' if c.name in empty else _taken(c)}" for c in columns)
+    bare = next((c.name for c in columns if c.name not in empty and (not c.unit or c.doubt)), None)
     unit = f"write its unit, as [degC] or [m]: --outputs '{bare} [UNIT]'; or " if bare else ""
     return InputError(
         f"{table.path}: a first plant is drawn from a temperature, position, velocity or level, and none is known in "
@@ -219,10 +223,14 @@ def _inputs(
             c for c in columns.values() if c.kind in kinds and c.kind != "temperature" and c not in sensors
         ]
     else:
-        drives = [columns[n] for n in named]
+        # a named input in % or 1 is a share of full
+        drives = [
+            replace(c, kind=c.kind or "duty" * (c.unit in ("%", "1")))
+            for c in map(columns.__getitem__, named)
+        ]
         for c in drives:
             if c.kind == "" and not c.unit:
-                raise _unclear(table, c, "--inputs", "as [W] or [N]")
+                raise _unclear(table, c, "--inputs", "as [W], [N] or, of a duty, [%] or [1]")
             if c.kind not in kinds:
                 raise InputError(
                     f"{table.path}: input '{c.name}'{_taken(c)}: one of {', '.join(kinds)} was expected"
