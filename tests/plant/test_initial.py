@@ -46,6 +46,15 @@ def test_inputs_alone_are_enough(folder, capsys, initial, start):
     assert "note: step.csv: no column 'T', which an output of p.yaml reads;" in printed.err
 
 
+def test_a_start_that_no_reading_gives_is_told(folder, capsys):
+    (folder / "p.yaml").write_text(PLANT.replace("first(T)", "25"))
+    (folder / "step.csv").write_text("t,heat,air,T\n0,10,20,40\n100,10,20,40\n200,0,20,40\n")
+    assert "starts at block = 25 ± 0.3 degC, as the plant file says" in ends(folder, capsys)[1].err
+    assert "as the plant file says" not in ends(folder, capsys, "--initial", "block=40")[1].err
+    (folder / "p.yaml").write_text(PLANT)
+    assert "as the plant file says" not in ends(folder, capsys)[1].err
+
+
 def test_a_forecast_goes_on_from_a_recordings_last_state(folder, capsys):
     t = np.arange(0.0, 400.0, 2.0)
     truth = 35 + (22 - 35) * np.exp(-t / 100)  # 7.5 W

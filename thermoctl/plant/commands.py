@@ -83,6 +83,8 @@ def simulate(args: argparse.Namespace, read: Reader | None = None) -> int:
         runs.append((table, excitation, x, y))
         title = f"{path}: " + (f"up to {args.horizon:g} s ahead" if args.horizon else "free run")
         measured = bool(np.isfinite(excitation.y).any())
+        if measured and not args.horizon and (note := _unread_starts(model, excitation)):
+            print(f"note: {path}: {note}", file=sys.stderr)
         Console().print(_compared(plant, title, excitation, y) if measured else _courses(plant, title, y))
     for file, write in ((args.out, _write), (args.plot, _plot)):
         for table, excitation, x, y in runs if file else ():
@@ -90,6 +92,25 @@ def simulate(args: argparse.Namespace, read: Reader | None = None) -> int:
             write(name, model, table, excitation, x, y)
             print(name)
     return 0
+
+
+def _unread_starts(model: Model, excitation: Excitation) -> str:
+    """Return a note on the nodes that start at a guess of the plant file, not at a reading; or ""."""
+    given = np.full(len(model.states), np.nan) if excitation.x0 is None else excitation.x0
+    starts = model.start(excitation, model.vector(None, excitation.name))[0]
+    guessed = [
+        f"{n} = {start:.4g} ± {node.initial_sigma:.2g} {node.unit or ''}".strip()
+        for n, start, own in zip(model.states, starts, given, strict=True)
+        if (node := model.plant.nodes[n]).initial_sigma
+        and np.isnan(own)
+        and not any(e.op == "first" for e in ex.walk(node.initial))
+    ]
+    if not guessed:
+        return ""
+    return (
+        f"starts at {', '.join(guessed)}, as the plant file says; a refit or a diagnosis fits this to the readings, "
+        "a free run does not (--initial NODE=VALUE)"
+    )
 
 
 def _initial(plant: Plant, args: argparse.Namespace) -> Mapping[str, float] | str | None:
