@@ -35,6 +35,18 @@ def test_plant_check_with_data(folder, capsys):
     assert cli.main(["plant", "check", "p.yaml", "p.yaml", "--data", "run.csv"]) == 2
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("rows", "says"), [(1, "1 row, of which"), (7, "7 rows, of which")])
+def test_a_few_rows_are_not_called_a_fit(folder, capsys, rows, says):
+    lines = (folder / "run.csv").read_text().splitlines()
+    (folder / "few.csv").write_text("\n".join(lines[: rows + 1]) + "\n")
+    assert cli.main(["plant", "check", "p.yaml", "--data", "few.csv"]) == 0
+    out = capsys.readouterr().out
+    assert (
+        f"warning: few.csv: {says} nothing is checked. Give 8 or more." in out and "fit the plant" not in out
+    )
+
+
 def test_diagnose_stops_at_a_severe_finding(folder, capsys, monkeypatch):
     given = {}
 

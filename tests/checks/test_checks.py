@@ -138,7 +138,7 @@ WRONG = {
     "loss of the wrong sign": ("rate: G_1 * (one - air)", "rate: G_1 * (air - one)", "unstable", "'loss_1'"),
     "other loss of the wrong sign": ("rate: G_2 * (two - air)", "rate: G_2 * (air - two)", "unstable", "'loss_2'"),
     "negative storage": ("storage: C_1", "storage: -C_1", "storage", "'one' is -6"),
-    "storage of zero": ("storage: C_2", "storage: C_2 - 6", "storage", "'two' is 0"),
+    "storage of zero": ("storage: C_2", "storage: C_2 - 6", "storage", "A node without storage cannot be"),
     "storages in kJ/K": ("C_1: {value: 6, unit: J/K, range: [2, 14]}", "C_1: {value: 6e-6, unit: J/K}", "sampling", "miss"),
 }  # fmt: skip
 

@@ -30,6 +30,8 @@ SLOWS = 0.25  # a body comes to rest if its last steps are below this share of i
 
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     """Check the columns that the plant reads."""
+    if len(table.t) < FEW:
+        return [_few(table)]
     findings = _gaps(model, table, excitation)
     read = [i for i in model.plant.readings() if i.column in table.columns]
     for item in read:
@@ -47,6 +49,16 @@ def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Fi
         return findings
     return (
         findings + _between(model, table, excitation, simulated) + _dead(model, table, excitation, simulated)
+    )
+
+
+def _few(table: Table) -> Finding:
+    return Finding(
+        "few",
+        table.path,
+        f"{len(table.t)} row{'s' * (len(table.t) != 1)}, of which nothing is checked",
+        f"Give {FEW} or more.",
+        severe=False,
     )
 
 

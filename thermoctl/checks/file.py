@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermoctl.checks.finding import Finding
-from thermoctl.checks.model import jacobian, unit_findings
+from thermoctl.checks.model import jacobian, storage_findings, unit_findings
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -39,21 +39,8 @@ def _value(e: Expr, values: Mapping[str, float]) -> float:
 
 
 def _storages(plant: Plant) -> list[Finding]:
-    findings = []
-    for node in plant.nodes.values():
-        if (
-            ex.names(node.storage) <= set(plant.parameters)
-            and not (q := _value(node.storage, _values(plant))) > 0
-        ):
-            findings.append(
-                Finding(
-                    "storage",
-                    f"{plant.file}:{node.at}",
-                    f"the storage of node '{node.name}' is {q:g}; a positive one was expected",
-                    "A negative heat capacity or mass turns every flow around: correct the sign.",
-                )
-            )
-    return findings
+    known = [n for n in plant.nodes.values() if ex.names(n.storage) <= set(plant.parameters)]
+    return [f for n in known for f in storage_findings(plant, n, _value(n.storage, _values(plant)))]
 
 
 def driving_away(plant: Plant) -> list[Flow]:

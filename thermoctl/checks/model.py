@@ -13,6 +13,7 @@ from thermoctl.checks.finding import Finding
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.whitening import default_noise
+from thermoctl.plant.language import Node
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
 
 GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
@@ -69,17 +70,18 @@ def _storages(model: Model, excitation: Excitation) -> list[Finding]:
     values = start_values(model, excitation)
     findings = []
     for node in model.plant.nodes.values():
-        storage = _value(node.storage, values)
-        if not storage > 0:
-            findings.append(
-                Finding(
-                    "storage",
-                    f"{model.plant.file}:{node.at}",
-                    f"the storage of node '{node.name}' is {storage:g}; a positive one was expected",
-                    "A negative heat capacity or mass turns every flow around: correct the sign.",
-                )
-            )
+        findings += storage_findings(model.plant, node, _value(node.storage, values))
     return findings
+
+
+def storage_findings(plant: Plant, node: Node, storage: float) -> list[Finding]:
+    """Return a finding where a node's storage is not positive."""
+    if storage > 0:
+        return []
+    what = f"the storage of node '{node.name}' is {storage:g}; a positive one was expected"
+    todo = "A negative heat capacity or mass turns every flow around: correct the sign."
+    todo = todo if storage < 0 else "A node without storage cannot be simulated: write its size."
+    return [Finding("storage", f"{plant.file}:{node.at}", what, todo)]
 
 
 def jacobian(plant: Plant, values: dict[str, float], flip: str | None = None) -> np.ndarray:
