@@ -102,6 +102,18 @@ def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys
     assert "--limit NAME=LOW:HIGH" in capsys.readouterr().err
 
 
+def test_a_plant_without_inputs_is_planned_by_a_recording(tmp_path, capsys):
+    (tmp_path / "p.yaml").write_text(
+        "format: thermoctl-plant/1\nparameters: {G: {value: 1}}\nnodes: {T: {storage: 1, initial: first(y)}}\n"
+        "flows: {loss: {from: T, rate: G * T}}\noutputs: {y: {value: T}}\n"
+    )
+    assert main(["plan", "--plant", str(tmp_path / "p.yaml")]) == 2
+    assert "has no inputs; a recording of it was expected (--like REC)" in capsys.readouterr().err
+    (tmp_path / "a.csv").write_text("t,z\n" + "".join(f"{k},{20 - k}\n" for k in range(20)))
+    assert main(["plan", "--plant", str(tmp_path / "p.yaml"), "--like", str(tmp_path / "a.csv")]) == 2
+    assert "another one: --columns y=COLUMN" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "path", sorted(shipped("config/plants/templates").glob("*.yaml")), ids=lambda p: p.stem
 )

@@ -138,6 +138,25 @@ def test_an_error_names_file_line_and_column(section, message):
     assert str(e.value).startswith(message)
 
 
+def test_initial_is_missing_and_initial_sigma_is_not_taken_for_it():
+    with pytest.raises(InputError) as e:
+        loads(
+            FILE.replace("unti", "unit")
+            .replace("many", "1")
+            .replace("valeu", "value")
+            .replace("initial: 0, ", ""),
+            "p.yaml",
+        )
+    assert str(e.value).endswith("node 'T': 'initial' is missing")
+
+
+def test_a_power_with_a_caret_is_answered_by_its_operator():
+    with pytest.raises(
+        ex.ExpressionError, match=r"'\^2' is not part of the language; a power is written \*\*;"
+    ):
+        ex.parse("a^2")
+
+
 NAMES = st.sampled_from(["T", "air", "P", "C", "G", "t", "pi"])
 
 

@@ -123,6 +123,8 @@ def _course(model: Model, limits: Ranges) -> Table:
         if name not in plant.inputs:
             raise InputError(f"--limit {name}: no input of {plant.file}; there are {', '.join(plant.inputs)}")
     driven = [n for n in plant.inputs if n in limits]
+    if not plant.inputs:
+        raise InputError(f"plan: {plant.file} has no inputs; a recording of it was expected (--like REC)")
     if not driven:
         raise InputError(
             "plan: a recording (--like REC) or the range of an input (--limit NAME=LOW:HIGH) was expected; inputs are "

@@ -204,7 +204,9 @@ class Section:
         self.asked.add(key)
         found: Node | None = self.node.value.get(key)
         if found is None and required:
-            near = difflib.get_close_matches(key, [k for k in self.node.value if k not in self.asked], n=1)
+            # a key such as initial_sigma is no misspelt initial
+            others = [k for k in self.node.value if k not in self.asked and not str(k).startswith(f"{key}_")]
+            near = difflib.get_close_matches(key, others, n=1)
             hint = f"; is '{near[0]}' meant to be it?" if near else ""
             raise self.node.error(f"{self.what}: '{key}' is missing{hint}")
         return found

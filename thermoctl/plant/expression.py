@@ -188,8 +188,9 @@ def parse(text: str | int | float) -> Expr:
     while position < len(text):
         match = _TOKEN.match(text, position)
         if not match:
+            power = "; a power is written **" if text[position:].lstrip().startswith("^") else ""
             raise ExpressionError(
-                f"'{text[position : position + 12].strip()}' is not part of the language; allowed are {ALLOWED}"
+                f"'{text[position : position + 12].strip()}' is not part of the language{power}; allowed are {ALLOWED}"
             )
         tokens.append((match.lastgroup or "", match.group(match.lastgroup or 0)))
         position = match.end()

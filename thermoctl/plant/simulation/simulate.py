@@ -236,7 +236,7 @@ class Model:
                 column = next(r.column for r in self.plant.readings() if r.name == key)
                 raise InputError(
                     f"recording {excitation.name}: first({key}) is asked for, but the recording has no value of it "
-                    f"(column '{column}')"
+                    f"(column '{column}'; another one: --columns {column}=COLUMN)"
                 )
             return excitation.first[key]
 
