@@ -109,22 +109,18 @@ def rms_of(errors: Sequence[np.ndarray], outputs: Sequence[str]) -> dict[str, fl
 
 
 def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
-    """Return the free-run errors (N, outputs) on a recording set aside, its initial states fitted."""
-    model = compile_plant(plant)
+    """Return the free-run errors (N, outputs) on a recording set aside, its initial states fitted.
+
+    NaN where it cannot be simulated."""
+    known = {k: dataclasses.replace(p, range=None) for k, p in plant.parameters.items()}
+    model = compile_plant(dataclasses.replace(plant, parameters=known))
     d = model.prepare(model.excitation(table))
     try:
-        run = model.run(d, None, None, sensitivities=True)
+        if model.uncertain and np.isfinite(d.y).any():
+            return refit.fit(model, [d], case.noise, seconds=np.inf).residuals[0]
+        return d.y - model.run(d).y
     except SimulationError:
         return np.full_like(d.y, np.nan)
-    assert run.dy is not None
-    error, good = d.y - run.y, np.isfinite(d.y)
-    if not model.uncertain:
-        return error
-    scale = np.array([n.sigma for n in case.noise])
-    start = run.dy[:, :, len(model.active) :]
-    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
-    rows, rest = (start / scale[None, :, None])[good] * prior, (error / scale)[good]
-    return error - start @ (np.linalg.solve(rows.T @ rows + np.eye(len(prior)), rows.T @ rest) * prior)
 
 
 def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
@@ -139,13 +135,7 @@ def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
         drives = [model.excitation(t) for t in train]
         try:
             refitted = refit.fit(
-                model,
-                drives,
-                case.noise,
-                iterations=STEPS,
-                tolerance=1e-3,
-                priors=f.fit.priors,
-                seconds=np.inf,
+                model, drives, case.noise, f.fit.z, STEPS, tolerance=1e-3, priors=f.fit.priors, seconds=np.inf
             )
             for r, t in enumerate(case.tables):
                 aside = model.excitation(_masked(t, measured, 1 - parity, False)).y
