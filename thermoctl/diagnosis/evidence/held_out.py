@@ -20,6 +20,7 @@ from thermoctl.recording.table import Table
 ENOUGH = 3  # from this number of recordings on, the last one is set aside
 # Blocks of a recording; with too few recordings, every other block is fitted and the rest checked.
 BLOCKS = 16
+STARTS = 30  # largest number of runs to fit the initial states of a recording set aside
 STEPS = 2  # largest number of steps from the refit of all blocks to that of half of them
 
 
@@ -112,13 +113,34 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Return the free-run errors (N, outputs) on a recording set aside, its initial states fitted.
 
     NaN where it cannot be simulated."""
-    known = {k: dataclasses.replace(p, range=None) for k, p in plant.parameters.items()}
-    model = compile_plant(dataclasses.replace(plant, parameters=known))
+    from scipy.optimize import least_squares  # slow to load, and only starts of other recordings need it
+
+    model = compile_plant(plant)
     d = model.prepare(model.excitation(table))
+    good = np.isfinite(d.y)
+    scale = np.broadcast_to([n.sigma for n in case.noise], d.y.shape)[good]
+    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        """Return the errors over the noise, and the starts z in standard deviations."""
+        try:
+            y = model.run(d, None, z * prior).y
+        except SimulationError:
+            return np.full(len(scale) + len(z), np.nan)
+        return np.append((d.y - y)[good] / scale, z)
+
+    def slopes(z: np.ndarray) -> np.ndarray:
+        """Return their derivatives (rows, starts)."""
+        run = model.run(d, None, z * prior, sensitivities=True)
+        assert run.dy is not None
+        start = run.dy[:, :, len(model.active) :][good] * prior
+        return np.concatenate([-start / scale[:, None], np.eye(len(z))])
+
     try:
-        if model.uncertain and np.isfinite(d.y).any():
-            return refit.fit(model, [d], case.noise, seconds=np.inf).residuals[0]
-        return d.y - model.run(d).y
+        z = np.zeros(len(prior))
+        if len(z) and np.isfinite(residuals(z)).all():
+            z = least_squares(residuals, z, slopes, max_nfev=STARTS).x
+        return d.y - model.run(d, None, z * prior).y
     except SimulationError:
         return np.full_like(d.y, np.nan)
 
