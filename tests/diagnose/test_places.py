@@ -76,7 +76,9 @@ def test_an_effect_that_the_plant_file_holds_already_comes_a_second_time_under_n
     extended = offered(plant, table, "heat_split")["winding-housing"].extend({"A": 0.1})
     again = offered(extended, table, "heat_split")["winding-housing"]
     assert not again.own_in(extended)
-    assert extended.parameters.items() <= again.extend({"A": 0.2}).parameters.items()
+    twice = again.extend({"A": 0.2})
+    assert extended.parameters.items() <= twice.parameters.items()
+    assert len(twice.flows) - len(extended.flows) == len(extended.flows) - len(plant.flows) > 0
 
 
 def test_a_period_that_has_not_come_twice_is_not_offered():

@@ -216,12 +216,16 @@ class _Builder:
     # A method for each kind of change, `_` and its key in an effect file (docs/reference/effect-files.md).
 
     def _flow(self, what: Mapping[str, Any]) -> None:
-        label = self.c.in_plant
-        while label in self.flows or label in self.nodes or label in self.outputs:
-            label += "_2"
         ends = {**self.made, **self.place.nodes}
         source, target = ends.get(what.get("from", "")), ends.get(what.get("into", ""))
-        self.flows[label] = Flow(label, self.expression(what["rate"]), source, target, None)
+        self._new_flow(self.c.in_plant, self.expression(what["rate"]), source, target, None)
+
+    def _new_flow(
+        self, label: str, rate: Expr, source: str | None, target: str | None, unit: str | None
+    ) -> None:
+        while label in self.flows or label in self.nodes or label in self.outputs:
+            label += "_2"
+        self.flows[label] = Flow(label, rate, source, target, unit)
 
     def _rate(self, form: str) -> None:
         f = self._changed_flow
@@ -302,8 +306,7 @@ class _Builder:
         a, b = self.place.nodes["a"], self.place.nodes["b"]
         for f in heats(self.rig.physics, a, self.rig):
             self.flows[f.name] = dataclasses.replace(f, rate=ex.mul(f.rate, ex.add(ex.ONE, ex.neg(share))))
-            label = f"{f.name}_to_{b}"
-            self.flows[label] = Flow(label, ex.mul(f.rate, share), None, b, f.unit)
+            self._new_flow(f"{f.name}_to_{b}", ex.mul(f.rate, share), None, b, f.unit)
 
     def _drive(self, form: str) -> None:
         f, swap = self._changed_flow, {self.place.input or "": self.expression(form)}
@@ -320,9 +323,9 @@ class _Builder:
         unit = next((f.unit for f in self.base.flows.values() if f.source == a), None)
         if b:
             share = name(self.c.own(what["share"]))
-            self.flows[f"spill_{a}_{b}"] = Flow(f"spill_{a}_{b}", ex.mul(over, share), a, b, unit)
+            self._new_flow(f"spill_{a}_{b}", ex.mul(over, share), a, b, unit)
             over = ex.mul(over, ex.add(ex.ONE, ex.neg(share)))
-        self.flows[f"spill_{a}_out"] = Flow(f"spill_{a}_out", over, a, None, unit)
+        self._new_flow(f"spill_{a}_out", over, a, None, unit)
 
     def _exponent(self, parameter: str) -> None:
         f = self._changed_flow
