@@ -95,9 +95,11 @@ def _misfit_of_signals(message: CanMessage, spec: Dbc, command: float) -> str:
     values = _values(message, signals, command)
 
     def raw(name: str) -> float:
+        """Return the number that the signal carries."""
         return float((values[name] - signals[name].offset) / signals[name].scale)
 
     def is_sent(name: str) -> bool:
+        """Return whether the frame's page holds the signal."""
         ids, by = signals[name].multiplexer_ids, signals[name].multiplexer_signal
         return not ids or by is None or (is_sent(by) and round(raw(by)) in ids)
 

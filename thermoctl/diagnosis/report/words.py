@@ -26,7 +26,9 @@ WORSE = (
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
 LIKELY = 0.05  # least probability of an effect that is mentioned with the verdict `consistent`
-CLEARLY = 1.5  # least held-out error, extended over refitted, that speaks against the extended plant
+# Least held-out error, extended over refitted, that speaks against the extended plant. Of 306 outputs of 100
+# diagnoses with findings the largest was 1.07.
+CLEARLY = 1.5
 LARGER = 1.1  # least error over the noise that is stated with the verdict `consistent`
 NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 

@@ -25,20 +25,9 @@ TURNED = (
     1.2  # friction alone never turns a free motion: its path is at most so many times the way from end to end
 )
 SPRING = 0.25  # a spring is written where it lowers the squared error of the balance to this share
-OWN = [
-    "speed",
-    "place",
-    "mass",
-    "inertia",
-    "damping",
-    "stiffness",
-    "rest",
-    "K_drive",
-    "drive",
-    "friction",
-    "spring",
-    "travel",
-]
+OWN = (  # names that the plant file itself gives
+    "speed", "place", "mass", "inertia", "damping", "stiffness", "rest", "K_drive", "drive", "friction", "spring", "travel",
+)  # fmt: skip
 DRIVES = ("force", "torque", "current", "voltage", "duty", "power")
 
 

@@ -224,10 +224,8 @@ def _inputs(
         ]
     else:
         # a named input in % or 1 is a share of full
-        drives = [
-            replace(c, kind=c.kind or "duty" * (c.unit in ("%", "1")))
-            for c in map(columns.__getitem__, named)
-        ]
+        drives = [columns[n] for n in named]
+        drives = [replace(c, kind="duty") if not c.kind and c.unit in ("%", "1") else c for c in drives]
         for c in drives:
             if c.kind == "" and not c.unit:
                 raise _unclear(table, c, "--inputs", "as [W], [N] or, of a duty, [%] or [1]")

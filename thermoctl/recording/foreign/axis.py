@@ -22,7 +22,7 @@ from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import known
 
 KINDS = {
-    "date and time": 62,
+    "date and time": 60,
     "date": 30,
     "time of day": 45,
     "duration": 45,
@@ -82,21 +82,18 @@ class Clock:
     @property
     def where(self) -> str:
         """Return the columns' names for people."""
-        return (
-            " and ".join(
-                f"column {int(place) + 1}"
-                if place and not name
-                else repr(name)
-                if name
-                else "the first column"
-                for name, _, place in (c.strip(" ").partition("\0") for c in self.columns)
-            )
-            or "the rows"
-        )
+        return " and ".join(map(_shown, self.columns)) or "the rows"
 
     def plus(self, points: float) -> Clock:
         """Return the clock with further points."""
         return replace(self, points=self.points + points)
+
+
+def _shown(column: str) -> str:
+    name, _, place = column.strip(" ").partition("\0")
+    if name:
+        return repr(name)
+    return f"column {int(place) + 1}" if place else "the first column"
 
 
 def _run(t: np.ndarray) -> tuple[int, str]:
