@@ -126,8 +126,9 @@ class Commanded:
     binding: Binding
     roles: list[int]
 
-    def prepare(self) -> None:
+    def __init__(self: Any, binding: Binding) -> None:
         """Find the channels of state and fault. Raises InputError where one has no role."""
+        super().__init__(binding)  # type: ignore[call-arg]
         amplifier = self.binding.profile.amplifier
         if amplifier is None:
             raise TypeError("a profile with 'drive' was expected")
@@ -157,6 +158,18 @@ class Commanded:
             for message, command in self.sequencer.off():
                 self.send_message(message, command)
         super().disconnect()  # type: ignore[misc]
+
+    def read(self: Any, sample: Sample, now_s: float) -> None:
+        """Take what has arrived; an assumed state counts as just reported."""
+        super().read(sample, now_s)  # type: ignore[misc]
+        if self.is_assumed:
+            self.put(sample, self.state_bound, 0.0, now_s)
+
+    def poll(self: Any, sample: Sample) -> None:
+        """Read every channel once; an assumed state counts as just reported."""
+        super().poll(sample)  # type: ignore[misc]
+        if self.is_assumed:
+            self.put(sample, self.state_bound, 0.0, time.monotonic())
 
     def send_message(self, message: Message, command: float) -> None:
         """Send one message; never blocks in a fast device. Raises OSError, HardwareError."""

@@ -199,10 +199,6 @@ def _shown(can_id: int) -> str:
 class DbcDrive(Commanded, DbcDevice):
     """An amplifier that takes messages of a DBC file."""
 
-    def __init__(self, binding: Binding) -> None:
-        DbcDevice.__init__(self, binding)
-        self.prepare()
-
     def send_message(self, message: Message, command: float) -> None:
         """Send one message. Raises OSError."""
         if self._port is None:
@@ -213,16 +209,9 @@ class DbcDrive(Commanded, DbcDevice):
         else:
             self._port.send((can_id, data))
 
-    def read(self, sample: Sample, now_s: float) -> None:
-        """Decode the frames that have arrived."""
-        super().read(sample, now_s)
-        if self.is_assumed:
-            self.put(sample, self.state_bound, 0.0, now_s)
-
     def switch_off(self) -> None:
         """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
-        super().connect()
-        self.sequencer.restart()
+        self.connect()
         sample = Sample(len(self.binding.channels.names))
         try:
             self.confirm_off(lambda: self.read(sample, time.monotonic()))

@@ -332,16 +332,6 @@ class ModbusDevice(Device):
 class ModbusDrive(Commanded, ModbusDevice):
     """An amplifier whose registers take the command (DAC, servo drive); its poller writes them."""
 
-    def __init__(self, binding: Binding) -> None:
-        ModbusDevice.__init__(self, binding)
-        self.prepare()
-
-    def poll(self, sample: Sample) -> None:
-        """Read every block; see ModbusDevice."""
-        super().poll(sample)
-        if self.is_assumed:
-            self.put(sample, self.state_bound, 0.0, time.monotonic())
-
     def send_message(self, message: Message, command: float) -> None:
         """Write a register. Raises HardwareError when the unit refuses it or does not answer."""
         m = typed(message, RegisterMessage)

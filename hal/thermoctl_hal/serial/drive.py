@@ -8,7 +8,6 @@ import time
 
 from thermoctl_hal.base.amplifier import Commanded
 from thermoctl_hal.base.backend import HardwareError, Sample
-from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.message import serial_bytes
 from thermoctl_hal.base.profile import Message
 from thermoctl_hal.serial.port import SerialDevice
@@ -16,10 +15,6 @@ from thermoctl_hal.serial.port import SerialDevice
 
 class SerialDrive(Commanded, SerialDevice):
     """An amplifier on a serial line."""
-
-    def __init__(self, binding: Binding) -> None:
-        SerialDevice.__init__(self, binding)
-        self.prepare()
 
     def send_message(self, message: Message, command: float) -> None:
         """Send one message. Raises OSError."""
@@ -32,12 +27,6 @@ class SerialDrive(Commanded, SerialDevice):
             written = 0
         if written < len(data):
             raise OSError(errno.ENOBUFS, "the line takes no data: is command_hz too high for its baud rate?")
-
-    def read(self, sample: Sample, now_s: float) -> None:
-        """Take what has arrived."""
-        super().read(sample, now_s)
-        if self.is_assumed:
-            self.put(sample, self.state_bound, 0.0, now_s)
 
     def switch_off(self) -> None:
         """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
