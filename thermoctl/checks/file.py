@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from thermoctl.checks.finding import Finding
-from thermoctl.checks.model import jacobian, storage_findings, unit_findings
+from thermoctl.checks.model import jacobian, storage_findings, unit_findings, value_of
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -34,13 +32,9 @@ def _values(plant: Plant, seed: int = 0) -> dict[str, float]:
     return values
 
 
-def _value(e: Expr, values: Mapping[str, float]) -> float:
-    return float(ex.evaluate(ex.undelayed(e), values))
-
-
 def _storages(plant: Plant) -> list[Finding]:
     known = [n for n in plant.nodes.values() if ex.names(n.storage) <= set(plant.parameters)]
-    return [f for n in known for f in storage_findings(plant, n, _value(n.storage, _values(plant)))]
+    return [f for n in known for f in storage_findings(plant, n, value_of(n.storage, _values(plant)))]
 
 
 def driving_away(plant: Plant) -> list[Flow]:
@@ -50,7 +44,7 @@ def driving_away(plant: Plant) -> list[Flow]:
     for flow in plant.flows.values():
         read = ex.names(flow.rate)
         own = [(e, way) for e, way in ((flow.source, -1.0), (flow.target, 1.0)) if e in read]
-        slopes = [way * _value(ex.derivative(flow.rate, str(e)), v) for e, way in own for v in values]
+        slopes = [way * value_of(ex.derivative(flow.rate, str(e)), v) for e, way in own for v in values]
         if slopes and min(slopes) > 0:
             flows.append(flow)
     return flows
@@ -128,8 +122,8 @@ def _parts(plant: Plant) -> list[set[str]]:
 def _homogeneous(plant: Plant, e: Expr, parameters: set[str]) -> bool:
     for seed in range(POINTS):
         values = _values(plant, seed)
-        value = _value(e, values)
-        total = sum(values[q] * _value(ex.derivative(e, q), values) for q in parameters & ex.names(e))
+        value = value_of(e, values)
+        total = sum(values[q] * value_of(ex.derivative(e, q), values) for q in parameters & ex.names(e))
         if not abs(total - value) <= HOMOGENEOUS * max(abs(value), 1e-12):
             return False
     return True

@@ -5,7 +5,7 @@ The linearised plant is dx/dt = J x. An eigenvalue l of J is a time constant 1/|
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -62,7 +62,8 @@ def start_values(model: Model, excitation: Excitation) -> dict[str, float]:
     }
 
 
-def _value(e: ex.Expr, values: dict[str, float]) -> float:
+def value_of(e: ex.Expr, values: Mapping[str, float]) -> float:
+    """Return an expression's value at these values of its names; a delay counts as none."""
     return float(ex.evaluate(ex.undelayed(e), values))
 
 
@@ -70,7 +71,7 @@ def _storages(model: Model, excitation: Excitation) -> list[Finding]:
     values = start_values(model, excitation)
     findings = []
     for node in model.plant.nodes.values():
-        findings += storage_findings(model.plant, node, _value(node.storage, values))
+        findings += storage_findings(model.plant, node, value_of(node.storage, values))
     return findings
 
 
@@ -91,11 +92,11 @@ def jacobian(plant: Plant, values: dict[str, float], flip: str | None = None) ->
     for flow in plant.flows.values():
         sign = -1.0 if flow.name == flip else 1.0
         for name in ex.names(flow.rate) & set(index):
-            slope = sign * _value(ex.derivative(flow.rate, name), values)
+            slope = sign * value_of(ex.derivative(flow.rate, name), values)
             for end, way in ((flow.target, 1.0), (flow.source, -1.0)):
                 if end is not None:
                     out[index[end], index[name]] += way * slope
-    storages = np.array([_value(n.storage, values) for n in plant.nodes.values()])
+    storages = np.array([value_of(n.storage, values) for n in plant.nodes.values()])
     return out / storages[:, None]
 
 

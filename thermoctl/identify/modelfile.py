@@ -41,11 +41,8 @@ class Calibration:
 
 def fingerprint(path: str | Path) -> str:
     """SHA-256 of a file."""
-    digest = hashlib.sha256()
     with Path(path).open("rb") as f:
-        while piece := f.read(1 << 20):
-            digest.update(piece)
-    return digest.hexdigest()
+        return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def save_model(

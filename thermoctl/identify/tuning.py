@@ -258,7 +258,6 @@ class Margins:
     phase_deg: float
     delay_s: float
     stable: bool
-    peak_sensitivity: float
 
 
 @functools.lru_cache(maxsize=16)
@@ -302,7 +301,7 @@ def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: i
         pm, delay = np.inf, np.inf
     turn = np.flatnonzero((phase[:-1] > -np.pi) & (phase[1:] <= -np.pi))
     gm = float(1 / size[turn].max()) if len(turn) else np.inf
-    return Margins(gm, pm, delay, gm > 1 and pm > 0, float(1 / np.abs(1 + loop).min()))
+    return Margins(gm, pm, delay, gm > 1 and pm > 0)
 
 
 def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:

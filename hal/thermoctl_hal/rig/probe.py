@@ -59,7 +59,6 @@ class Probe:
         )
         self.sample = Sample()
         self.device: Device | None = None if isinstance(spec, Cia402) else driver(self._binding)
-        self._objects: dict[Object, int | str] = {}
 
     def open(self) -> None:
         """Open the port. Raises HardwareError, InputError."""

@@ -138,7 +138,7 @@ SERIAL: dict[str, tuple[Key, ...]] = {
             "pattern",
             "text",
             "regular expression of a line with the groups `data` and `sum` (hexadecimal)",
-            r"\$(?P<data>.*)\*(?P<sum>[0-9A-Fa-f]{2})",
+            _NMEA,
         ),
     ),
     "channel of serial-lines": (

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 
 BASES = (10, 16)
-DECIMALS = (".", ",")
 _SHOWN = 60  # largest number of characters of a line in a message
 _NUMBER = {
     (10, "."): re.compile(r"([-+]?) *(\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?)$", re.ASCII),

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from thermoctl.plant.first.columns import UNITS, Column, identifiers, noise
-from thermoctl.plant.first.thermal import MARGIN, UNKNOWN_SCALE, confirm, held, parameter, unknown
+from thermoctl.plant.first.thermal import MARGIN, UNKNOWN_SCALE, confirm, held, integral, parameter, unknown
 from thermoctl.recording.table import Table
 
 
@@ -81,17 +81,11 @@ def _sizes(t: np.ndarray, inflow: np.ndarray | None, levels: Sequence[np.ndarray
     """Return a tank's area, m^2, and its outlet's coefficient, m^2.5/s, from the balance of the volume.
 
     Without an inflow the area is 1."""
-    dt = np.diff(t)
-
-    def integral(values: np.ndarray) -> np.ndarray:
-        """Return the integral over time up to each sample (N,); each value holds until the next sample."""
-        return np.concatenate([[0.0], np.cumsum(values[:-1] * dt)])
-
     stored = np.sum([h - h[0] for h in levels], axis=0)
-    lost = integral(np.sqrt(np.maximum(levels[-1], 0.0)))
+    lost = integral(t, np.sqrt(np.maximum(levels[-1], 0.0)))
     if inflow is None:
         return 1.0, max(-float(np.sum(stored * lost) / max(float(np.sum(lost**2)), 1e-12)), 1e-9)
-    volume = integral(inflow)
+    volume = integral(t, inflow)
     area, outlet = map(float, np.linalg.lstsq(np.column_stack([stored, lost]), volume, rcond=None)[0])
     if not area > 0:
         area = max(float(volume[-1]), 1e-12) / max(float(np.ptp(stored)), 1e-9)

@@ -195,25 +195,24 @@ def _sizes(
     """Return a body's heat capacity, J/K, and conductance to the air, W/K, from the heat balance.
 
     Without heats the capacity is 1."""
-    dt = np.diff(t)
-
-    def integral(values: np.ndarray) -> np.ndarray:
-        """Return the integral over time up to each sample (N,); each value holds until the next sample."""
-        return np.concatenate([[0.0], np.cumsum(values[:-1] * dt)])
-
     stored = np.sum([v - v[0] for v in sensors], axis=0)
-    lost = np.sum([integral(v - air) for v in sensors], axis=0)
+    lost = np.sum([integral(t, v - air) for v in sensors], axis=0)
     span = float(t[-1] - t[0])
     if not heats:
         conductance = -float(np.sum(stored * lost) / max(float(np.sum(lost**2)), 1e-12))
         return 1.0, conductance if conductance > 0 else 1 / span
-    energy = integral(np.sum(heats, axis=0))
+    energy = integral(t, np.sum(heats, axis=0))
     capacity, conductance = np.linalg.lstsq(np.column_stack([stored, lost]), energy, rcond=None)[0]
     if not capacity > 0:
         capacity = max(abs(energy[-1]) / max(float(np.ptp(stored)), 1e-9), 1e-9)
     if not conductance > 0:
         conductance = capacity / span
     return float(capacity), float(conductance)
+
+
+def integral(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the integral over time up to each sample (N,); each value holds until the next sample."""
+    return np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(t))])
 
 
 def _end(t: np.ndarray, sensors: Sequence[np.ndarray]) -> float:
