@@ -1,10 +1,12 @@
-"""A whole schedule in simulated time."""
+"""The simulated rig for tests: its rig file in a folder, and a whole schedule in simulated time."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import deque
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,45 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.offline.simulate import Simulation
+
+ROOT = Path(__file__).resolve().parents[1]
+QUICK = 50  # heat capacities of a quick rig are divided by it: a thermal hour passes in 72 s
+QUICK_LIMITS = (
+    ("slew_um_s: 1", "slew_um_s: 50"),
+    ("temperatures_c: 900", "temperatures_c: 18"),
+    ("period_s: 7200", "period_s: 144"),
+)
+"""Changes of a rig file that go with a quick plant."""
+
+
+def rig_file(folder: Path, *changes: tuple[str, str], name: str = "rig") -> Path:
+    """Write config/simulated.yaml into `folder`, where its socket and its recordings are too; return its path.
+
+    changes: texts of that file, and what replaces them.
+    """
+    text = (ROOT / "config/simulated.yaml").read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    for old, new in (
+        ("plants/", f"{ROOT}/config/plants/"),
+        ("models/", f"{ROOT}/config/models/"),
+        ("../run/", f"{folder}/"),
+        ("../recordings", f"{folder}/recordings"),
+    ):
+        text = text.replace(old, new)
+    path = folder / f"{name}.yaml"
+    path.write_text(text)
+    return path
+
+
+def quick_plant(plant: Path) -> str:
+    """Return a shipped plant file's text with heat capacities QUICK times smaller, and without their ranges."""
+    return re.sub(
+        r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
+        lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
+        plant.read_text(),
+    )
 
 
 def run_simulated(

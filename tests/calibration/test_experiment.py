@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.simulated import QUICK, QUICK_LIMITS, ROOT, quick_plant, rig_file
 from thermoctl import cli
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import tuner
@@ -18,8 +19,6 @@ from thermoctl.identify.online import Tuner
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import INDEX
 
-ROOT = Path(__file__).resolve().parents[2]
-QUICK = 50  # heat capacities are divided by it: an hour passes in 72 s
 SHORT = """\
 format: thermoctl-experiments/1
 rate_um_s: 16.6667
@@ -33,28 +32,14 @@ experiments:
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """A folder with a rig whose heat is QUICK times faster, its experiments, no model."""
-    text = (ROOT / "config/plants/actuator.yaml").read_text()
-    (tmp_path / "plant.yaml").write_text(
-        re.sub(
-            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
-            text,
-        )
-    )
-    text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (
+    (tmp_path / "plant.yaml").write_text(quick_plant(ROOT / "config/plants/actuator.yaml"))
+    rig_file(
+        tmp_path,
+        *QUICK_LIMITS,
         ("plants/actuator.yaml", "plant.yaml"),
         ("model: models/simulated.yaml", 'model: ""'),
-        ("slew_um_s: 1", "slew_um_s: 50"),
-        ("temperatures_c: 900", "temperatures_c: 18"),
         ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25"),
-        ("period_s: 7200", "period_s: 144"),
-        ("../run/", f"{tmp_path}/"),
-        ("../recordings", f"{tmp_path}/recordings"),
-    ):
-        assert old in text, old
-        text = text.replace(old, new)
-    (tmp_path / "rig.yaml").write_text(text)
+    )
     (tmp_path / "experiments.yaml").write_text(SHORT)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -224,15 +209,8 @@ def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypa
 
 
 def _thermal(folder: Path) -> Path:
-    text = (ROOT / "config/plants/actuator_thermal.yaml").read_text()
     path = folder / "thermal.yaml"
-    path.write_text(
-        re.sub(
-            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
-            text,
-        )
-    )
+    path.write_text(quick_plant(ROOT / "config/plants/actuator_thermal.yaml"))
     return path
 
 

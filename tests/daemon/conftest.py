@@ -1,32 +1,20 @@
 """A configuration of its own for each test: the simulated rig with a model, its files in the test's directory."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.daemon.process import patient
+from tests.simulated import rig_file
 from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import CompensatorModel
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
 def config(tmp_path):
     """Path of a configuration like config/simulated.yaml, socket and recordings in tmp_path, no real-time priority."""
-    text = patient((ROOT / "config/simulated.yaml").read_text())
-    for old, new in (
-        ("plants/", f"{ROOT}/config/plants/"),
-        ("../run/", f"{tmp_path}/"),
-        ("../recordings", f"{tmp_path}/recordings"),
-        ("models/", f"{ROOT}/config/models/"),
-    ):
-        text = text.replace(old, new)
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
-    return path
+    return patient(rig_file(tmp_path))
 
 
 @pytest.fixture

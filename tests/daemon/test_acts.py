@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.process import ROOT, Daemon, patient, wait
+from tests.simulated import rig_file
 from thermoctl import cli
 from thermoctl.configuration.which_rig import ACTS
 from thermoctl.daemon import lock
@@ -55,22 +56,17 @@ RADIATES = PLANT.replace(
 )
 
 
-def rig_file(folder, name, faults=""):
+def own_rig(folder, name, faults=""):
     """config/simulated.yaml with its files in `folder`."""
-    text = patient((ROOT / "config/simulated.yaml").read_text())
-    for old, new in (
-        ("plants/", f"{ROOT}/config/plants/"),
-        ("../run/simulated.sock", f"{folder}/{name}.sock"),
+    path = rig_file(
+        folder,
+        ("simulated.sock", f"{name}.sock"),
         ("../recordings", f"{folder}/{name}-recordings"),
-        ("models/", f"{ROOT}/config/models/"),
         ("  backend: simulated\n", f"  backend: simulated\n{faults}"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / f"{name}.yaml"
-    path.write_text(text)
+        name=name,
+    )
     (folder / "experiments.yaml").write_text((ROOT / "config/experiments.yaml").read_text())
-    return path
+    return patient(path)
 
 
 @pytest.fixture(scope="module", params=["READY", "ARMED", "FAULT"])
@@ -78,8 +74,8 @@ def foreign(request, tmp_path_factory):
     """A daemon in this state, as `thermoctl run` in another terminal."""
     folder = tmp_path_factory.mktemp(request.param.lower())
     broken = "  faults: [{kind: error, role: coil_c, at_s: 8}]\n" if request.param == "FAULT" else ""
-    daemon = Daemon(rig_file(folder, "own", broken))
-    daemon.other, daemon.state = rig_file(folder, "other"), request.param
+    daemon = Daemon(own_rig(folder, "own", broken))
+    daemon.other, daemon.state = own_rig(folder, "other"), request.param
     if request.param != "READY":
         daemon.armed()
         assert daemon.ask("setpoint", value=3.0)["ok"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.simulated import run_simulated
+from tests.simulated import ROOT, rig_file, run_simulated
 from thermoctl.cli import main
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.misfit import BLOCK_S, Misfit
@@ -14,27 +14,18 @@ from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.recording.writer import RecordingWriter
 from thermoctl.rig.signals import INDEX
 
-ROOT = Path(__file__).parents[2]
-
 
 def rig(folder, heat=None):
     """Settings of the simulated rig that records into `folder`; `heat`: watts into its coil that no model knows of."""
-    text = (ROOT / "config" / "simulated.yaml").read_text()
-    for name in ("plants", "models", "devices"):
-        text = text.replace(f"{name}/", f"{ROOT / 'config' / name}/")
-    directory = folder / "recordings"
-    text = text.replace("../recordings", str(directory))
+    changes = []
     if heat:
         plant = (ROOT / "config" / "plants" / "actuator.yaml").read_text()
         (folder / "changed.yaml").write_text(
             plant.replace("\nflows:\n", f"\nflows:\n  outside: {{into: coil, rate: {heat}, unit: W}}\n", 1)
         )
-        text = text.replace(str(ROOT / "config" / "plants" / "actuator.yaml"), str(folder / "changed.yaml"))
-    path = folder / "rig.yaml"
-    path.write_text(text)
-    settings = load_settings(path)
-    assert Path(settings.recording.directory) == directory
-    return path, settings
+        changes.append(("plants/actuator.yaml", "changed.yaml"))
+    path = rig_file(folder, *changes)
+    return path, load_settings(path)
 
 
 def recorded(settings, minutes):

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.simulated import QUICK, QUICK_LIMITS, ROOT, quick_plant, rig_file
 from thermoctl.configuration.settings import load_settings
 from thermoctl.control import arming, faults
 from thermoctl.daemon.offline.simulate import Simulation
@@ -21,8 +21,6 @@ from thermoctl.rig.signals import INDEX
 from thermoctl_hal.base.backend import ROLE
 from thermoctl_hal.simulated.faulty import Fault, FaultInjector
 
-ROOT = Path(__file__).resolve().parents[2]
-QUICK = 50.0  # the quick rig's heat capacities are so many times smaller
 JUMP_UM = 0.5  # arming may not move the stage more than this
 
 
@@ -48,32 +46,19 @@ def quick_settings(folder: Path):
     from thermoctl.identify.linearise import linearise
     from thermoctl.identify.modelfile import save_model
 
-    for name in ("actuator", "actuator_thermal"):
-        text = (ROOT / f"config/plants/{name}.yaml").read_text()
-        text = re.sub(
-            r"(  C_\w+: +\{value: )([\d.]+)(, unit: J/K), range: \[[^]]*\]",
-            lambda m: f"{m[1]}{float(m[2]) / QUICK}{m[3]}",
-            text,
-        )
-        (folder / f"{name}.yaml").write_text(text)
+    for name in ("actuator.yaml", "actuator_thermal.yaml"):
+        (folder / name).write_text(quick_plant(ROOT / "config/plants" / name))
     model = linearise(load(folder / "actuator_thermal.yaml"), 0.001, 0.1, expansion_period_s=0.02)
     model = dataclasses.replace(model, air_filter_s=model.air_filter_s / QUICK)
     save_model(folder / "model.yaml", model, "simulated", [folder / "actuator_thermal.yaml"])
-    text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (
+    path = rig_file(
+        folder,
+        *QUICK_LIMITS,
         ("plants/", ""),
         ("models/simulated.yaml", "model.yaml"),
-        ("slew_um_s: 1", "slew_um_s: 50"),
-        ("temperatures_c: 900", "temperatures_c: 18"),
         ("coil_limit_c: 80", "coil_limit_c: 80\n  coil_rate_k_s: 25\n  innovation_time_s: 0.6"),
-        ("period_s: 7200", "period_s: 144"),
-        ("../run/", f"{folder}/"),
-        ("../recordings", f"{folder}/recordings"),
-    ):
-        assert old in text, old
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    return load_settings(folder / "rig.yaml")
+    )
+    return load_settings(path)
 
 
 class HazardRig(Simulation):

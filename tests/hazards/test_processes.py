@@ -15,6 +15,7 @@ import pytest
 
 from tests.daemon.process import LIMIT_S, Daemon, wait
 from tests.hazards.harness import ROOT, ROWS, Row
+from tests.simulated import rig_file
 from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.files import read_table
@@ -24,17 +25,8 @@ pytestmark = pytest.mark.slow
 
 def start(folder, directory):
     """The simulated rig's daemon, recording into `directory`, its files in `folder`."""
-    text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (
-        ("plants/", f"{ROOT}/config/plants/"),
-        ("models/", f"{ROOT}/config/models/"),
-        ("../run/", f"{folder}/"),
-        ("../recordings", str(directory)),
-        ("reference: true", "reference: false"),
-    ):
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    found = Daemon(folder / "rig.yaml")
+    changes = ("../recordings", str(directory)), ("reference: true", "reference: false")
+    found = Daemon(rig_file(folder, *changes))
     assert found.process.poll() is None, found.log
     return found
 

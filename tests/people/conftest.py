@@ -6,25 +6,14 @@ from pathlib import Path
 import pytest
 from browser import Browser, find
 
+from tests.simulated import rig_file
 from thermoctl.configuration.settings import load_settings
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
 def settings():
     with tempfile.TemporaryDirectory(prefix="thermoctl") as folder:
-        text = (ROOT / "config/simulated.yaml").read_text()
-        for old, new in (
-            ("plants/", f"{ROOT}/config/plants/"),
-            ("models/", f"{ROOT}/config/models/"),
-            ("../run/", f"{folder}/"),
-            ("../recordings", f"{folder}/rec"),
-        ):
-            text = text.replace(old, new)
-        path = Path(folder) / "rig.yaml"
-        path.write_text(text)
-        yield load_settings(path)
+        yield load_settings(rig_file(Path(folder)))
 
 
 @pytest.fixture

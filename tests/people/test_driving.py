@@ -140,8 +140,7 @@ def test_kill_9_of_the_command_disarms(command, folder, running):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_command_ends_with_its_daemon(command, event, folder):
     """Exit status 3 and one line. That the drive is off is judged at the wire, in the last test of this file."""
-    Path("rig.yaml").write_text(patient(Path("rig.yaml").read_text()))
-    daemon = Daemon(folder / "rig.yaml")
+    daemon = Daemon(patient(folder / "rig.yaml"))
     try:
         process = subprocess.Popen(
             [sys.executable, "-m", "thermoctl.cli", *COMMANDS[command]],

@@ -22,8 +22,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("reader")
     for name in ("config", "docs/examples"):
         shutil.copytree(ROOT / name, place / name)
-    config = place / "config/simulated.yaml"
-    config.write_text(patient(config.read_text()))
+    config = patient(place / "config/simulated.yaml")
     yield place
     subprocess.run([BIN / "thermoctl", "stop", "--config", config], cwd=place, capture_output=True)
 

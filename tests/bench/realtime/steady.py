@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.realtime.run import ROOT, Bench, machine
+from tests.simulated import rig_file
 
 Sample = tuple[float, int, int]  # time (h, share or s), resident kB, descriptors
 GROWTH = 0.01
@@ -44,19 +45,8 @@ def look(pid: int | str = "self") -> tuple[int, int]:
 
 def configuration(work: Path) -> Path:
     """The simulated rig, recording into `work` within a budget that hours of it exceed many times."""
-    text = (ROOT / "config/simulated.yaml").read_text()
-    for old, new in (
-        ("models/", f"{ROOT}/config/models/"),
-        ("plants/", f"{ROOT}/config/plants/"),
-        ("../recordings", f"{work}/recordings"),
-        ("../run/", f"{work}/"),
-        ("budget_gb: 2", "budget_gb: 0.05"),
-        ("tier_budget_gb: 0.5", "tier_budget_gb: 0.01"),
-    ):
-        assert old in text, old
-        text = text.replace(old, new)
-    (work / "steady.yaml").write_text(text)
-    return work / "steady.yaml"
+    budgets = ("budget_gb: 2", "budget_gb: 0.05"), ("tier_budget_gb: 0.5", "tier_budget_gb: 0.01")
+    return rig_file(work, *budgets)
 
 
 def simulated(work: Path, hours: float) -> list[Sample]:
