@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.limits import OFF
+from tests.limits import OFF, channels
 from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel, Parameters
 from thermoctl.rig.channels import CHANNELS, DEFAULT, GROUPS, INDEX, TEMPERATURES
@@ -30,13 +30,6 @@ SCENARIOS: list[Callable[[Any], None]] = []
 def scenario(function):
     SCENARIOS.append(function)
     return function
-
-
-def channels(default, **given):
-    array = np.full(len(CHANNELS), float(default))
-    for name, number in given.items():
-        array[AT[name]] = number
-    return array
 
 
 def model(gain=0.0, slow=0.0):

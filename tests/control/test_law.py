@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.limits import OFF
+from tests.limits import OFF, channels
 from thermoctl.control import arming, faults, law
 from thermoctl.control.law import AIR_READINGS, OUTPUTS, Law
 from thermoctl.control.model import CompensatorModel, Parameters, zero_model
@@ -20,13 +20,6 @@ OUT = {name: i for i, name in enumerate(OUTPUTS)}
 ESTIMATES = slice(len(OUTPUTS), len(OUTPUTS) + 12)
 REQUIRED = ("position_um", "voltage_v", "current_a", "coil_c")
 AMBIENT = 22.0
-
-
-def channels(default, **given):
-    array = np.full(len(CHANNELS), float(default))
-    for name, number in given.items():
-        array[INDEX[name]] = number
-    return array
 
 
 def parameters(**changes):

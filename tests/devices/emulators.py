@@ -28,6 +28,13 @@ def modbus_crc(data: bytes) -> bytes:
     return struct.pack("<H", crc)
 
 
+def free_port() -> int:
+    """Return a TCP port of this machine that nobody listens on."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
 def words(value: float | int, form: str, little: bool = False) -> list[int]:
     """Registers of a number; form: a letter of struct."""
     data = struct.pack(">" + form, value)

@@ -19,13 +19,14 @@ import struct
 import tempfile
 import threading
 import time
-import tty
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import can
 
+from tests.devices.emulators import modbus_crc
+from tests.devices.harness import Line as Terminal
 from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, STALE, HardwareError, Sample
 from thermoctl_hal.base.wire import Framer
@@ -64,14 +65,8 @@ def damaged(frame: bytes, r: random.Random) -> bytes:
     )
 
 
-class Line:
+class Line(Terminal):
     """A pseudo-terminal; `send` returns when its bytes can be read at the other end."""
-
-    def __init__(self) -> None:
-        self.master, self.slave = os.openpty()
-        tty.setraw(self.slave)
-        os.set_blocking(self.master, False)
-        self.path = os.ttyname(self.slave)
 
     def send(self, data: bytes) -> None:
         """Send what fits, and throw away what the driver has sent."""
@@ -386,16 +381,6 @@ class ModuleOnTcp(Module):
         return request[:4] + struct.pack(">H", len(pdu) + 1) + request[6:7] + pdu
 
 
-def crc(data: bytes) -> bytes:
-    """CRC-16 of Modbus RTU, as its specification computes it."""
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
-    return struct.pack("<H", value)
-
-
 class ModuleOnLine(Module):
     """Over a serial line."""
 
@@ -414,7 +399,7 @@ class ModuleOnLine(Module):
         return f"rtu:{self.line.path}"
 
     def whole(self, request: bytes, pdu: bytes) -> bytes:
-        return request[:1] + pdu + crc(request[:1] + pdu)
+        return request[:1] + pdu + modbus_crc(request[:1] + pdu)
 
 
 class Setup(Fuzzed):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests.devices.emulators import free_port
 from thermoctl.files import yamlfile
 from thermoctl.rig.channels import DEFAULT
 from thermoctl_hal.base.backend import ROLE, STATUS_NAMES, Sample
@@ -65,12 +65,6 @@ def make_settings(directory: Path, **hal: object) -> SimpleNamespace:
         protection=SimpleNamespace(required=tuple(ROLE)),
         hal=SimpleNamespace(**{**values, **hal}),
     )
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 class Wire:

@@ -14,6 +14,7 @@ import tty
 
 import pytest
 
+from tests.devices.emulators import modbus_crc
 from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, STALE, HardwareError, Sample
 from thermoctl_hal.modbus.device import LOST_POLLS, ModbusDevice
@@ -35,16 +36,6 @@ channels:
   c: {{register: {far}, scale: 0.1, unit: degC, range: [-50, 300], rate_hz: 100, stale_after_s: {stale}}}
 """
 ROLES = "{a: coil_c, b: air_c, c: shaft_1_c}"
-
-
-def crc(data):
-    """CRC-16 of the serial framing, bit by bit as the specification has it, low byte first."""
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
-    return struct.pack("<H", value)
 
 
 class Module:
@@ -100,10 +91,10 @@ class Module:
                 request = b""
                 while len(request) < 8:
                     request += os.read(self.master, 8 - len(request))
-                assert crc(request[:6]) == request[6:]
+                assert modbus_crc(request[:6]) == request[6:]
                 if answer := self.pdu(request[1:6]):
                     frame = bytes((self.unit,)) + answer
-                    os.write(self.master, self.spoil(frame + crc(frame)))
+                    os.write(self.master, self.spoil(frame + modbus_crc(frame)))
 
     def close(self):
         self.done = True

@@ -12,8 +12,8 @@ import tty
 
 import pytest
 
+from tests.devices.emulators import modbus_crc
 from tests.devices.harness import HEAD
-from tests.hal.test_modbus_faults import crc
 from thermoctl.files import yamlfile
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import ERROR, OK, ROLE, HardwareError, Sample
@@ -181,7 +181,7 @@ def test_gaps_that_a_server_refuses_or_passes_over_in_silence_are_left_out(made,
         (lambda s, r, pdu, _: framed(r, pdu, length=9), "wrong length: 9 bytes are announced, 5 came"),
         (lambda s, r, pdu, _: framed(r, pdu + b"\0\0"), "wrong length: .* check 'type'"),
         (lambda s, r, pdu, _: framed(r, b"\x03\x04" + bytes(4)), "wrong length: 4 bytes .* 2 were asked"),
-        (lambda s, r, pdu, _: r[6:7] + pdu + crc(r[6:7] + pdu), "rtu:socket://"),
+        (lambda s, r, pdu, _: r[6:7] + pdu + modbus_crc(r[6:7] + pdu), "rtu:socket://"),
         (lambda s, r, pdu, _: None, "no answer within 0.2 s: .*'timeout_s'.*max_gap"),
     ],
 )
@@ -318,14 +318,14 @@ class RtuLine:
             if not select.select([self.master], [], [], 0.05)[0]:
                 continue
             data += os.read(self.master, 256)
-            if len(data) >= 8 and crc(data[:6]) == data[6:8]:
+            if len(data) >= 8 and modbus_crc(data[:6]) == data[6:8]:
                 request, data = data[:8], data[8:]
                 function, address, count = struct.unpack(">BHH", request[1:6])
                 words = [REGISTERS[address + k] for k in range(count)] if function == 3 else []
                 body = request[:2] + (
                     struct.pack(f">B{count}H", 2 * count, *words) if words else request[2:6]
                 )
-                os.write(self.master, self.spoil(request, body + crc(body)))
+                os.write(self.master, self.spoil(request, body + modbus_crc(body)))
 
 
 @pytest.fixture
@@ -365,11 +365,11 @@ def test_the_echo_of_a_write_is_no_confirmation(line):
     "spoil,words",
     [
         (
-            lambda r, a: b"\x09" + a[1:-2] + crc(b"\x09" + a[1:-2]),
+            lambda r, a: b"\x09" + a[1:-2] + modbus_crc(b"\x09" + a[1:-2]),
             "of unit 9, unit 1 was asked: check 'address'",
         ),
         (
-            lambda r, a: b"\x01\x04\x02\x00\x01" + crc(b"\x01\x04\x02\x00\x01"),
+            lambda r, a: b"\x01\x04\x02\x00\x01" + modbus_crc(b"\x01\x04\x02\x00\x01"),
             "function 4, 3 was asked for: check 'kind'",
         ),
         (lambda r, a: a[:-1] + bytes((a[-1] ^ 1,)), "wrong CRC, or cut short: check the baud rate"),
@@ -383,4 +383,4 @@ def test_a_wrong_rtu_answer_names_what_is_wrong(line, spoil, words):
 
 def test_an_rtu_exception_behind_an_echo_is_its_code(line):
     body = b"\x01\x83\x02"
-    assert line(lambda r, a: r + body + crc(body)).read("holding", 0, 1, 1, 0.5) == 2
+    assert line(lambda r, a: r + body + modbus_crc(body)).read("holding", 0, 1, 1, 0.5) == 2

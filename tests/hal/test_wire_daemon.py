@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from tests.daemon.process import forget
-from tests.hal.conftest import CONFIG, free_port
+from tests.devices.emulators import free_port
+from tests.hal.conftest import CONFIG
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
 from thermoctl.files.yamlfile import InputError

@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from tests.limits import OFF
+from tests.limits import OFF, channels
 from thermoctl.control import arming, faults
 from thermoctl.control.law import WARM_UP_TICKS
 from thermoctl.control.model import CompensatorModel, Parameters, packed_length
@@ -20,13 +20,6 @@ from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, ROLES, STALE, Sa
 NEEDED = ("position_um", "voltage_v", "current_a", "air_c", "coil_c", "amplifier_state")
 LIMIT = 1.5
 PERIOD_S = 1e-3
-
-
-def channels(default, **given):
-    array = np.full(len(ROLES), float(default))
-    for name, number in given.items():
-        array[ROLE[name]] = number
-    return array
 
 
 def parameters(**changes):

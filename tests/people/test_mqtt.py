@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from tests.devices.emulators import free_port
 from thermoctl import cli
 from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.signals import INDEX
@@ -23,9 +24,7 @@ def broker(tmp_path):
     """The port of a broker on loopback that lets in `rig` with a password, and anonymous readers."""
     if BROKER is None:
         pytest.skip("no mosquitto on this machine: MQTT is not tested (apt-get install mosquitto)")
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
+    port = free_port()
     log = (tmp_path / "broker.log").open("wb")
     process = subprocess.Popen([BROKER, "-p", str(port)], stdout=log, stderr=log)
     deadline = time.monotonic() + LIMIT_S
@@ -120,9 +119,7 @@ def test_what_is_refused(settings, capsys):
     ):
         with pytest.raises(InputError, match=message):
             Bridge(settings, **arguments)
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
+    port = free_port()
     assert cli.main(["mqtt", "--config", str(settings.path), "--broker", f"127.0.0.1:{port}"]) == 2
     assert "cannot be reached" in capsys.readouterr().err
     assert cli.main(["mqtt", "--config", str(settings.path), "--broker", "127.0.0.1", "--rate", "99"]) == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hal.conftest import free_port
+from tests.devices.emulators import free_port
 from tests.rigs.axes import Axes
 from thermoctl.configuration.settings import load_rig
 from thermoctl_hal.rig.make import make_backends

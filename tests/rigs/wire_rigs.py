@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.devices.emulators import free_port
 from thermoctl.recording.files import read_table
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -167,9 +167,7 @@ class OnWire:
         self.config = folder / "config" / rig.config
         text = self.config.read_text()
         for port in re.findall(r"127\.0\.0\.1:(\d+)", text):
-            with socket.socket() as s:
-                s.bind(("127.0.0.1", 0))
-                text = text.replace(port, str(s.getsockname()[1]))
+            text = text.replace(port, str(free_port()))
         self.config.write_text(text)
         self.config.with_name("experiments.yaml").write_text(EXPERIMENTS)
         for path in (folder / "config/devices").glob("thermocouples-*.yaml"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.daemon.process import Daemon, wait
-from tests.hal.conftest import free_port
+from tests.devices.emulators import free_port
 from tests.scenarios import canbus
 
 ROOT = Path(__file__).resolve().parents[2]
