@@ -9,23 +9,23 @@ from __future__ import annotations
 import os
 
 os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
-import contextlib  # noqa: E402
-import io  # noqa: E402
-import sys  # noqa: E402
-import tempfile  # noqa: E402
-import time  # noqa: E402
-import warnings  # noqa: E402
-from functools import partial  # noqa: E402
-from itertools import product  # noqa: E402
-from pathlib import Path  # noqa: E402
+import contextlib
+import io
+import sys
+import tempfile
+import time
+import warnings
+from functools import partial
+from itertools import product
+from pathlib import Path
 
-import numpy as np  # noqa: E402
-from scipy import linalg  # noqa: E402
+import numpy as np
+from scipy import linalg
 
-from tests.identify.peers import identify_validated, initial_state, time_constant_s  # noqa: E402
-from tests.reproduction import paper  # noqa: E402
-from thermoctl.identify import expansion, kernels, modal  # noqa: E402
-from thermoctl.identify.statespace import StateSpace  # noqa: E402
+from tests.identify.peers import identify_validated, initial_state, time_constant_s
+from tests.reproduction import paper
+from thermoctl.identify import expansion, kernels, modal
+from thermoctl.identify.statespace import StateSpace
 
 warnings.filterwarnings("ignore")
 MISSED: list[str] = []
@@ -171,7 +171,7 @@ def models() -> None:
     try:
         ipsid(u, noisy[0])
         peers["PSID"] = ipsid
-    except Exception as e:  # noqa: BLE001  a peer that does not run is reported, not hidden
+    except Exception as e:
         print(f"    PSID: does not run here: {type(e).__name__}: {str(e)[:90]}")
     found = {k: [run(u, v) for v in noisy] for k, run in peers.items()}
     found["ours, real poles"] = [modal.identify(modal.reduce((u, v), 1.0), 8) for v in noisy]
@@ -248,7 +248,7 @@ def scale() -> None:
                 0.06,
                 f"{t - reading:.2f} / {theirs:.1f} s, its radius {radius(p):.6f}",
             )
-        except Exception as e:  # noqa: BLE001
+        except Exception as e:
             print(f"    ctrlsys does not run at 18 M: {type(e).__name__}: {str(e)[:90]}")
 
 
@@ -388,7 +388,7 @@ def measured_data() -> None:
 
                 try:
                     held = left(fit(cut), cut, len(u))
-                except Exception:  # noqa: BLE001, S112  an order the peer cannot do
+                except Exception:
                     continue
                 looked[peer] = min(looked[peer], rms(held))
                 parts = []

@@ -242,7 +242,7 @@ def weak(s: System, d: Drawn) -> Rates:
     rng = np.random.default_rng(0)
     theta, slopes, names = [], [], list(s.states)
     for x, u, run in zip(_read(s, d), _inputs(d), d.runs[:-1], strict=True):
-        np.random.seed(int(rng.integers(1 << 31)))  # noqa: NPY002  (PySINDy draws its domains from it)
+        np.random.seed(int(rng.integers(1 << 31)))
         library = ps.WeakPDELibrary(
             ps.PolynomialLibrary(degree=3, include_bias=True), spatiotemporal_grid=run.t, K=200
         )

@@ -27,7 +27,7 @@ def test_iso230_by_hand():
 
 def test_approaches_are_found_with_their_direction():
     s = np.array([0, 0, 1, 2, 2, 2, 2, 1, 0, 0, 0, 0.0])
-    assert [(t, d) for _, t, d in iso230.approaches(s, s, 1)][-2:] == [(2.0, 1), (0.0, -1)]
+    assert [(t, d) for _, t, d in iso230.approaches(s, 1)][-2:] == [(2.0, 1), (0.0, -1)]
 
 
 def test_schedules_of_the_paper():

@@ -54,9 +54,7 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
     return float(e.mean()), float(2 * e.std(ddof=1))
 
 
-def approaches(
-    setpoint_um: np.ndarray, reference_um: np.ndarray, settle: int
-) -> list[tuple[int, float, int]]:
+def approaches(setpoint_um: np.ndarray, settle: int) -> list[tuple[int, float, int]]:
     """Find the stops of the motion.
 
     Return (index `settle` samples after arrival, target, direction +1 or -1) of each.
@@ -89,7 +87,7 @@ def figures(table: Table, path: str) -> list[str]:
     lines = [
         f"{path}: {mean:+.3f} +- {two_s:.3f} um (mean deviation, 2 s, {int(rest.sum())} samples at rest)"
     ]
-    stops = approaches(reference, output, max(1, round(SETTLE_S / np.median(np.diff(table.t)))))
+    stops = approaches(reference, max(1, round(SETTLE_S / np.median(np.diff(table.t)))))
     for way, word in ((1, "upwards"), (-1, "downwards")):
         targets = np.round([v for _, v, d in stops if d == way], 3)
         deviations = np.round([error[k] for k, _, d in stops if d == way], 3)

@@ -136,7 +136,7 @@ def _resume(settings: Settings, shared: Shared, rig: loops.Axis) -> None:
     )
 
 
-def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
+def _recorder_process(settings: Settings, shared: Shared) -> int:
     from thermoctl.daemon.recorder import make_recorder, record
 
     stop = Stop(shared, RECORDER)
@@ -145,7 +145,7 @@ def _recorder_process(settings: Settings, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
+def _command_process(settings: Settings, shared: Shared) -> int:
     stop = Stop(shared, COMMANDS)
     loops.die_with_parent()
     path = Path(settings.socket.path)
@@ -159,7 +159,7 @@ def _command_process(settings: Settings, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _tuner_process(settings: Settings, shared: Shared, board: Any) -> int:
+def _tuner_process(settings: Settings, shared: Shared) -> int:
     from thermoctl.daemon import tuner
 
     stop = Stop()
@@ -175,7 +175,7 @@ def _tuner_process(settings: Settings, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
+def _reference_process(settings: Settings, shared: Shared) -> int:
     stop = Stop(shared, REFERENCE)
     loops.die_with_parent()
     loops.become_real_time(settings, lambda text: None)
@@ -183,7 +183,7 @@ def _reference_process(settings: Settings, shared: Shared, board: Any) -> int:
     return EXIT_OK
 
 
-def _poller_process(settings: Settings, shared: Shared, board: Any, device: str) -> int:
+def _poller_process(settings: Settings, board: Any, device: str) -> int:
     """Poll the devices of a port, of which `device` is one."""
     loops.die_with_parent()
     groups = ports(slow_devices(settings))
@@ -285,14 +285,13 @@ def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | Non
     ) -> Child:
         """Return a helper of an axis; `beat`: place of its heartbeat in `s`, None: it is not watched."""
         beats = None if beat is None else partial(s.beats, beat)
-        return Child(f"{name} {own.axis}".strip(), main, own, s, board, beats=beats)
+        return Child(f"{name} {own.axis}".strip(), main, own, s, beats=beats)
 
     others = [
         Child(
             f"poller {group[0].name}",
             _poller_process,
             settings,
-            shared[0],
             board,
             group[0].name,
             beats=partial(board.beat, group[0].roles),

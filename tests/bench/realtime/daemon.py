@@ -15,7 +15,7 @@ from thermoctl.daemon import supervisor
 from thermoctl.daemon.tick import loop
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "build/bench-realtime"))
-from batch import Probe  # noqa: E402
+from batch import Probe
 
 
 def main(config: str, stamps_path: str, ticks: str) -> int:

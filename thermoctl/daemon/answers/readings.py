@@ -157,7 +157,7 @@ def _described(
         "follows": cause,
         "late_s": late_s,
         "late_first": bool(late_s) and fault.is_timed and not is_stated,
-        "messages": _messages(fault, hit, found, code),
+        "messages": _messages(fault, hit, code),
     }
 
 
@@ -207,10 +207,7 @@ def _remedy(loss: losses.Loss, reading: Mapping[str, Any], now_wall_s: float) ->
 
 
 def _messages(
-    fault: causes.Standing,
-    hit: list[tuple[str, str]],
-    found: Mapping[str, Any],
-    code: Mapping[str, Any] | None,
+    fault: causes.Standing, hit: list[tuple[str, str]], code: Mapping[str, Any] | None
 ) -> list[str]:
     """Return the devices' messages, each once with its channels; the drive's error code first."""
     roles: dict[str, list[str]] = {}  # by message: a lost device gives each channel the same one
