@@ -47,7 +47,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     begin_s = row[AT["wall_s"]] - row[AT["t_s"]]
     for c, role in enumerate(shared.channels.names):
         state = verdict(int(statuses[c]), shared.areas["verdicts"][c])
-        last = _or_none(values[c])
+        last = finite(values[c])
         said = shared.remarks.get(c) or (0, math.nan, "")
         by_role[role] = {
             "value": last if state == "OK" else None,
@@ -55,7 +55,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
             "state": state,
             "age_s": None if state == "ABSENT" else round(float(shared.areas["ages"][c]), 3),
             "message": said[2],
-            "message_wall_s": _or_none(begin_s + said[1]),
+            "message_wall_s": finite(begin_s + said[1]),
         }
     return by_role
 
@@ -222,5 +222,6 @@ def _messages(
     return said
 
 
-def _or_none(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """Return a number for JSON; None where it is not finite."""
     return float(value) if math.isfinite(value) else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -62,7 +61,7 @@ def status(shared: Shared) -> dict[str, Any]:
     by_role = readings.readings(shared, row)
     valid, coil = readings.valid_signals(shared.channels, by_role), shared.channels.coil
     number = {
-        name: float(row[i]) if math.isfinite(row[i]) and valid.get(name, True) else None
+        name: readings.finite(row[i]) if valid.get(name, True) else None
         for name, i in shared.row.index.items()
     }
     estimated = not shared.counters[NO_MODEL]
@@ -88,7 +87,7 @@ def status(shared: Shared) -> dict[str, Any]:
         "estimates_c": {p: number[f"{p}_est_c"] for p in shared.channels.point_names},
         "lateness_us": number["lateness_us"],
         "busy_us": number["busy_us"],
-        "busy_p50_us": _or_none(busy[0]),
+        "busy_p50_us": readings.finite(busy[0]),
         "tuning_percent": float(shared.counters[TUNING]) - 1.0 if shared.counters[TUNING] else None,
         "recorder": {
             "rows": int(shared.counters[RECORDER_ROWS]),
@@ -121,14 +120,10 @@ def latency(shared: Shared, period_s: float) -> dict[str, Any]:
         p50, p99, p999 = percentiles(counts)
         answer[name] = {
             "count": int(counts.sum()),
-            "p50_us": _or_none(p50),
-            "p99_us": _or_none(p99),
-            "p999_us": _or_none(p999),
+            "p50_us": readings.finite(p50),
+            "p99_us": readings.finite(p99),
+            "p999_us": readings.finite(p999),
             "largest_us": float(shared.areas["largest"][k]),
             "bins_us": [[int(i), int(counts[i])] for i in counts.nonzero()[0]],
         }
     return answer
-
-
-def _or_none(number: float) -> float | None:
-    return number if math.isfinite(number) else None

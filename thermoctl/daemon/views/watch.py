@@ -24,7 +24,7 @@ import numpy as np
 from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
 from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN
-from thermoctl.daemon.answers.readings import hide_invalid, invalid
+from thermoctl.daemon.answers.readings import finite, hide_invalid, invalid
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.tick.assemble import compensator, rig_identity, shared_name
 from thermoctl.daemon.tick.shared import Shared
@@ -211,7 +211,7 @@ class Watch:
         if len(rows):
             with np.errstate(all="ignore"):
                 frame["range"] = {
-                    n: [_finite(np.fmin.reduce(column)), _finite(np.fmax.reduce(column))]
+                    n: [finite(np.fmin.reduce(column)), finite(np.fmax.reduce(column))]
                     for n, column in ((n, hide_invalid(rows, n, self.settings.row)) for n in RANGED)
                 }
         return frame
@@ -219,7 +219,7 @@ class Watch:
     def _sigma(self, row: np.ndarray) -> float | None:
         """Return the innovation's expected standard deviation, K: S = R_v / (1 - C K), from (35)."""
         share = self._gain * row[AT["kalman_gain"]]
-        return _finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
+        return finite(math.sqrt(self._noise_c2 / (1.0 - share))) if 0.0 <= share < 1.0 else None
 
     def _remember(self, rows: np.ndarray, output_is: str) -> None:
         """Append the last row of each PAST_STEP_S to `past`, and drop rows older than a minute."""
@@ -232,7 +232,7 @@ class Watch:
                 "ok": True,
                 "state": arming.STATES[int(row[AT["state"]])],
                 "output_is": output_is,
-                **{n: _finite(column[k]) for n, column in columns.items()},
+                **{n: finite(column[k]) for n, column in columns.items()},
             }
             if self.past and row[_WALL] < self.past[-1]["wall_s"]:
                 self.past.clear()  # the clock was set back
@@ -305,7 +305,7 @@ def recorded_past(settings: Settings) -> list[dict[str, Any]]:
             "ok": True,
             "state": arming.STATES[round(columns["state"][k])],
             "output_is": output_is,
-            **{n: _finite(columns[n].get(k, math.nan)) for n in PAST},
+            **{n: finite(columns[n].get(k, math.nan)) for n in PAST},
         }
         for k in sorted(columns["state"])
     ]
@@ -318,7 +318,3 @@ def _down() -> dict[str, Any]:
         "faults": [],
         "error": "the daemon is not running: `thermoctl start`",
     }
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if math.isfinite(number) else None
