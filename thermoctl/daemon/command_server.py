@@ -264,7 +264,7 @@ class _Client:
         self.holds = False
 
 
-def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
+def listen(path: Path, group: str | None) -> socket.socket:
     """Return a listening socket at `path`, for owner and group.
 
     Raises InputError where it cannot be made.
@@ -284,7 +284,7 @@ def listen(path: Path, group: str | None, mode: int = 0o660) -> socket.socket:
         listener.bind(str(path))
         if group:
             os.chown(path, -1, grp.getgrnam(group).gr_gid)
-        os.chmod(path, mode)
+        os.chmod(path, 0o660)
     except (OSError, KeyError) as e:
         listener.close()
         why = f"no group '{group}' on this system" if isinstance(e, KeyError) else e.strerror or str(e)

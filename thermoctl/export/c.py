@@ -16,12 +16,12 @@ _ESDIRK = Path(plant_compile.__file__).with_name("esdirk.h")
 _HERE = Path(__file__).parent
 
 
-def c_source(plant: Plant, numbers: Values, title: str = "") -> str:
+def c_source(plant: Plant, numbers: Values) -> str:
     """Return a C file; with -DMAIN a program that reads inputs as CSV and writes outputs."""
-    return core(plant, Equations(plant), numbers, title) + f"\n#ifdef MAIN\n{_text('main.h')}#endif\n"
+    return core(plant, Equations(plant), numbers) + f"\n#ifdef MAIN\n{_text('main.h')}#endif\n"
 
 
-def core(plant: Plant, e: Equations, numbers: Values, title: str = "") -> str:
+def core(plant: Plant, e: Equations, numbers: Values) -> str:
     """Return the equations, the integrator and one run (model.h), without a program or an interface."""
     jacobian = e.jacobian()
     lu, _, entries = sparse_lu(len(e.states), [(i, k) for i, k, _ in jacobian])
@@ -44,7 +44,7 @@ def core(plant: Plant, e: Equations, numbers: Values, title: str = "") -> str:
     lines += [all(plant.inputs[i].linear for i in ex.names(signal)) for signal, _ in delayed]
     slopes = e.emit([d for *_, d in jacobian])
     parts = [
-        f"/* {title or plant.title or plant.file}, written by `thermoctl plant export`. */\n#include <math.h>\n",
+        f"/* {plant.title or plant.file}, written by `thermoctl plant export`. */\n#include <math.h>\n",
         "".join(f"#define {k} {v}\n" for k, v in sizes.items()),
         PRELUDE,
         _numbers("PARAMETERS", numbers.parameters.values()),

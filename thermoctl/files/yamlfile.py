@@ -237,12 +237,12 @@ class Section:
         node = self.get(key, default is None)
         return float(default or 0.0) if node is None else number_of(node, self.label(key), low, high)
 
-    def optional_number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """Return the number of `key` within low..high, None where it is missing or empty.
+    def optional_number(self, key: str, low: float = -math.inf) -> float | None:
+        """Return the number of `key`, `low` at least, None where it is missing or empty.
 
         Raises InputError."""
         node = self.given(key)
-        return None if node is None else number_of(node, self.label(key), low, high)
+        return None if node is None else number_of(node, self.label(key), low)
 
     def integer(self, key: str, default: int | None = None, low: int = 0, high: int = 2**32) -> int:
         """Return a whole number; text like '0x6041' is hexadecimal. Raises InputError."""
@@ -258,11 +258,11 @@ class Section:
             raise node.error(f"{self.label(key)}: true or false was expected, found {kind_of(node)}")
         return node.value
 
-    def interval(self, key: str, default: tuple[float, float] = (-math.inf, math.inf)) -> tuple[float, float]:
-        """Return the pair [low, high] of `key`. Raises InputError."""
+    def interval(self, key: str) -> tuple[float, float]:
+        """Return the pair [low, high] of `key`, unbounded where it is missing. Raises InputError."""
         node = self.get(key, False)
         if node is None:
-            return default
+            return -math.inf, math.inf
         label = self.label(key)
         if not isinstance(node.value, list) or len(node.value) != 2:
             raise node.error(f"{label}: two numbers [low, high] were expected, found {kind_of(node)}")

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from thermoctl import __version__
 from thermoctl.diagnosis.run import diagnose_files
@@ -129,14 +129,14 @@ def run_all(
 class Reporter:
     """Progress on stderr: one line a case with the time that is left."""
 
-    def __init__(self, stream: TextIO | None = None):
-        self.started, self.stream = time.monotonic(), stream or sys.stderr
+    def __init__(self) -> None:
+        self.started = time.monotonic()
 
     def __call__(self, count: int, total: int, run: Run) -> None:
         left = (time.monotonic() - self.started) / count * (total - count)
         what = f" {run['error']}" if run["error"] else ""
         print(
             f"[{count}/{total}] {run['name']} {run.get('seconds') or 0:.0f} s, {left / 60:.1f} min left{what}",
-            file=self.stream,
+            file=sys.stderr,
             flush=True,
         )

@@ -182,11 +182,7 @@ def _between(x: np.ndarray, y: np.ndarray, k: int, at: float) -> float:
 
 
 def disagreement(
-    measured: Measured,
-    models: tuple[SecondOrder, SecondOrder],
-    gains: Gains,
-    period_s: float,
-    average: int = 1,
+    measured: Measured, models: tuple[SecondOrder, SecondOrder], gains: Gains, period_s: float, average: int
 ) -> str:
     """Return how a measured loop contradicts its prediction; '' if it does not.
 

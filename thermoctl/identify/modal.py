@@ -60,9 +60,9 @@ class Blocks:
     basis: np.ndarray
 
 
-def gram_polynomials(q: int, r: int = MOMENTS) -> np.ndarray:
-    """Return orthonormal discrete polynomials (r, q) of degree 0..r-1 on q points; fewer when q < r."""
-    r = min(r, q)
+def gram_polynomials(q: int) -> np.ndarray:
+    """Return orthonormal discrete polynomials (r, q) of degree 0..r-1 on q points; r: MOMENTS, at most q."""
+    r = min(MOMENTS, q)
     vander = np.polynomial.legendre.legvander(np.linspace(-1, 1, q) if q > 1 else np.zeros(1), r - 1)
     return np.ascontiguousarray(np.linalg.qr(vander)[0].T)
 
@@ -176,7 +176,7 @@ class _Fit:
     iterations: int
 
 
-def _project(F: np.ndarray, Y: np.ndarray, ridge: float = 1e-7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _project(F: np.ndarray, Y: np.ndarray, ridge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Q of F, the residue matrix and the residual.
 
     A ridge of `ridge` times each column's norm keeps nearly equal poles harmless.
@@ -197,8 +197,8 @@ def _fit(
     rest: bool,
     iterations: int,
     bounds: tuple[float, float],
-    ridge: float = 1e-7,
-    drift_s: tuple[float, float] | None = None,
+    ridge: float,
+    drift_s: tuple[float, float] | None,
 ) -> _Fit:
     """Fit ln tau within its bounds. `Y` (J, l) is scaled by noise, `weight` (J,) is by row."""
     Y = _whitened(Y, blocks, drift_s) * weight[:, None]

@@ -317,7 +317,7 @@ def _held(model: SecondOrder, w: np.ndarray, period_s: float) -> np.ndarray:
 
 
 def share_of_margins(
-    models: Sequence[SecondOrder], gains: Gains, period_s: float, moving_average: int = 1
+    models: Sequence[SecondOrder], gains: Gains, period_s: float, moving_average: int
 ) -> float:
     """Return the smallest margin on any model as a share of the wanted one: 1 or more is good, 0 unstable."""
     by_model = [margins(m, gains, period_s, moving_average) for m in models]
@@ -325,7 +325,7 @@ def share_of_margins(
 
 
 def robust(
-    models: Sequence[SecondOrder], period_s: float, moving_average: int = 1, derivative: bool = True
+    models: Sequence[SecondOrder], period_s: float, moving_average: int, derivative: bool = True
 ) -> Gains:
     """Return the fastest lambda tuning of the first model with the wanted margins on all of them.
 
@@ -339,10 +339,10 @@ def robust(
     raise InputError("no lambda tuning reaches the wanted margins on this model")
 
 
-def within_factor(present: Gains, wanted: Gains, factor: float = FACTOR) -> Gains:
-    """Return the wanted gains, each within a `factor` of the present one."""
+def within_factor(present: Gains, wanted: Gains) -> Gains:
+    """Return the wanted gains, each within a factor of FACTOR of the present one."""
     kp, ti, td = (
-        min(max(b, a / factor), a * factor) if a > 0.0 else b
+        min(max(b, a / FACTOR), a * FACTOR) if a > 0.0 else b
         for a, b in zip(_three(present), _three(wanted), strict=True)
     )
     return replace(wanted, kp=kp, ti_s=ti, td_s=td)

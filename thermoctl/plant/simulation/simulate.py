@@ -6,7 +6,7 @@ import ctypes
 import dataclasses
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -509,11 +509,10 @@ class Model:
         period_s: float,
         u0: np.ndarray,
         parameters: Mapping[str, float] | None = None,
-        first: Mapping[str, float] | None = None,
         rtol: float = 1e-5,
     ) -> Stepper:
         """Return a Stepper for a simulated rig: one fixed period at a time; `u0` (inputs,) at the start."""
-        return Stepper(self, period_s, np.asarray(u0, float), parameters, dict(first or {}), rtol)
+        return Stepper(self, period_s, np.asarray(u0, float), parameters, rtol)
 
 
 def compile_plant(plant: Plant, active: tuple[str, ...] | None = None) -> Model:
@@ -549,7 +548,6 @@ class Stepper:
     period_s: float
     u0: np.ndarray
     parameters: Mapping[str, float] | None = None
-    first: dict[str, float] = field(default_factory=dict)
     rtol: float = 1e-5
 
     def __post_init__(self) -> None:
@@ -563,13 +561,12 @@ class Stepper:
         """Return to the start with these inputs (nu,)."""
         m = self.model
         self._p = m.vector(self.parameters)
-        named = dict(zip(m.inputs, u0, strict=True))
         excitation = Excitation(
             "start",
             np.zeros(1),
             np.atleast_2d(np.asarray(u0, float)).copy(),
             np.empty((1, 0)),
-            {**named, **self.first},
+            dict(zip(m.inputs, u0, strict=True)),
             np.zeros(len(m.inputs), np.intc),
         )
         self.x, _ = m.start(excitation, self._p)
