@@ -551,20 +551,15 @@ class Stepper:
     rtol: float = 1e-5
 
     def __post_init__(self) -> None:
-        code = self.model.code
-        if code.input_delays or code.output_delays:
-            raise InputError(f"{self.model.plant.file}: a plant with delay() cannot run as a simulated rig")
-        self._library = machine_code(self.model.plant, (), stepper=True).library
-        self.reset(self.u0)
-
-    def reset(self, u0: np.ndarray) -> None:
-        """Return to the start with these inputs (nu,)."""
-        m = self.model
+        m, u0 = self.model, self.u0
+        if m.code.input_delays or m.code.output_delays:
+            raise InputError(f"{m.plant.file}: a plant with delay() cannot run as a simulated rig")
+        self._library = machine_code(m.plant, (), stepper=True).library
         self._p = m.vector(self.parameters)
         excitation = Excitation(
             "start",
             np.zeros(1),
-            np.atleast_2d(np.asarray(u0, float)).copy(),
+            np.array([u0], float),
             np.empty((1, 0)),
             dict(zip(m.inputs, u0, strict=True)),
             np.zeros(len(m.inputs), np.intc),
@@ -575,8 +570,7 @@ class Stepper:
         self._y = np.empty(len(m.outputs))
         self._want = np.zeros(1)
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
-        self._scale = np.abs(self.x) * 1e-2 + 1e-3
-        self._atol = self.rtol * self._scale
+        self._atol = self.rtol * (np.abs(self.x) * 1e-2 + 1e-3)
         self._memory = np.zeros(
             self._library.memory_size()
         )  # the matrix of the exponential method, see integrator.h
