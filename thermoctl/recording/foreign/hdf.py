@@ -14,6 +14,8 @@ from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import spelled
 
+_NONE = b"N."  # None as PyTables pickles it
+
 
 def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[Sheet]:
     """Return the named group of an HDF5 file, else that with most cells, as a table. Raises InputError."""
@@ -63,24 +65,41 @@ def _text(value: Any) -> str:
 
 def _columns(name: str, item: Any) -> dict[str, Cells]:
     """Return the columns of a dataset: of a matrix and of a table's field with several values one each."""
-    values = item[()]
+    values, said = item[()], item.attrs
     if values.dtype.names is not None:
         fields = {n: np.asarray(values[n]) for n in values.dtype.names}
-        return {k: c for n, v in fields.items() if v.ndim < 3 for k, c in _split(n, v, None).items()}  # noqa: PLR2004
-    titles = item.parent.get(name.replace("_values", "_items")) if name.startswith("block") else None
-    if name == "axis1" and _text(item.attrs.get("kind", "")).startswith("datetime64"):
-        values = values.astype("datetime64[ns]")
-    return _split("index" if name == "axis1" else name, values, titles)
+        if (kind := _text(said.get("index_kind", ""))) and "index" in fields:  # to_hdf(format="table")
+            info = _text(item.parent.attrs.get("info", ""))
+            own = (re.findall(r"\nVindex_name\np\d+\nV([^\n]*)", info) or ["index"])[0]
+            rest = {n: v for n, v in fields.items() if n != "index"}
+            fields = {own: _dated(fields["index"], kind, "\nVtz\n" in info), **rest}
+        titles = {n: _pickled(said.get(f"{n}_kind", "")) for n in fields}
+        return {k: c for n, v in fields.items() if v.ndim < 3 for k, c in _split(n, v, titles[n]).items()}  # noqa: PLR2004
+    if name in ("axis1", "index") and "kind" in said:
+        values = _dated(values, _text(said["kind"]), "tz" in said)
+        name = _text(said["name"]) if "name" in said and said["name"] != _NONE else "index"
+    elif name == "values":  # a series
+        name = _text(item.parent.attrs.get("name", name))
+    items = item.parent.get(name.replace("_values", "_items")) if name.startswith("block") else None
+    return _split(name, values, [_text(t) for t in items[()]] if items is not None else [])
 
 
-def _split(name: str, values: np.ndarray, titles: Any) -> dict[str, Cells]:
+def _dated(values: np.ndarray, kind: str, zoned: bool) -> np.ndarray:
+    """Return the index of a data frame as the dates that its kind states; UTC stays a number of an epoch."""
+    unit = re.match(r"(datetime64|timedelta64)(?:\[(\w+))?", kind)
+    return values.astype(f"{unit[1]}[{unit[2] or 'ns'}]") if unit and not zoned else values
+
+
+def _pickled(value: Any) -> list[str]:
+    """Return the texts of a list that PyTables pickled, without unpickling it: that could run code."""
+    return re.findall(r"\na?[VI]([^\n]*)", _text(value))
+
+
+def _split(name: str, values: np.ndarray, titles: list[str]) -> dict[str, Cells]:
     if values.ndim == 1:
         return {name: _cells(values)}
-    own = (
-        [_text(t) for t in titles[()]]
-        if titles is not None
-        else [f"{name}_{k + 1}" for k in range(values.shape[1])]
-    )
+    width = values.shape[1]
+    own = titles if len(titles) == width else [f"{name}_{k + 1}" for k in range(width)]
     return {n: _cells(c) for n, c in zip(own, values.T, strict=True)}
 
 
