@@ -43,16 +43,23 @@ _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # large, in ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by
 # chance.
 EVENER, ENOUGH = 0.5, 20
+_ZONES = ("utc", "gmt", "lst", "mst", "mdt", "pst", "pdt", "cst", "cdt", "est", "edt")  # MIDC
 _FIELDS = {  # names of the parts of a date that have a column each
     "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
     "month": ("month", "mm", "mo", "mon", "monat", "mois", "mes", "mese"),
     "day": ("day", "dd", "dy", "tag", "jour", "dia", "día", "giorno"),
     "doy": ("doy", "julian", "jday", "julday", "day_of_year", "dayofyear", "jd"),
     "hour": ("hour", "hh", "hr", "stunde", "heure", "hora", "ora"),
-    "hhmm": ("hhmm", "time", "hourmin", "hour_minute"),
+    "hhmm": ("hhmm", "time", "hourmin", "hour_minute", *_ZONES),
     "minute": ("minute", "min", "mi", "minuto", "minuti"),
     "second": ("second", "ss", "sec", "sekunde", "seconde", "segundo", "secondo"),
 }
+# Orders and ranges of these parts in the first columns of a table without names, as weather files have them.
+_ORDERS = """year doy month day hour minute | year month day hour minute | year month day hour minute second
+    | year doy hhmm | doy hhmm | year month day hour"""
+_NO_NAME = re.compile(r"column_\d+$")
+_RANGES = {"year": (1900, 2100), "month": (1, 12), "day": (1, 31), "doy": (1, 366), "hour": (0, 24)}
+_RANGES |= {"hhmm": (0, 2400), "minute": (0, 60), "second": (0, 60)}
 
 
 @dataclass(frozen=True)
@@ -208,6 +215,7 @@ def _complete(cells: Cells) -> Cells:
 
 def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: int) -> Clock:
     name, unit, kind = columns[0], sheet.units.get(columns[0]), seconds.kind
+    seconds = clock.of_one_year(seconds)
     by_name = max(named(c) for c in columns) if len(columns) > 1 else named(name)
     running, runs = _run(seconds.t)
     generic = position == 0 and is_generic(name) and len(sheet.columns) > 1
@@ -256,18 +264,33 @@ def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
             start = clock.later(seconds.start, float(part[0])) if seconds.start else None
             whole = replace(seconds, t=t, start=start, note=seconds.note + f" and {unit}")
             yield _judged(sheet, (*columns, names[after]), whole, names.index(columns[0])).plus(2 * JOINED)
-    if (parts := _of_parts(sheet)) is not None:
+    at = {key: n for n in sheet.columns for key, names in _FIELDS.items() if n.strip().lower() in names}
+    if (parts := _of_parts(sheet, at) or _of_first_columns(sheet)) is not None:
         yield _judged(sheet, *parts, 0).plus(2 * JOINED)
 
 
-def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
+def _of_first_columns(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
+    """Return a clock of first columns without names, if they are parts of a date that runs evenly."""
+    names = list(filter(_NO_NAME.match, sheet.columns))
+    for order in map(str.split, _ORDERS.split("|")):
+        at = dict(zip(order, names, strict=False))
+        if len(at) == len(order) and all(_within(sheet.columns[n], *_RANGES[key]) for key, n in at.items()):
+            parts = _of_parts(sheet, at)
+            if parts and len(parts[0]) == len(at) and "evenly" in _run(clock.of_one_year(parts[1]).t)[1]:
+                return parts
+    return None
+
+
+def _within(cells: Cells, low: float, high: float) -> bool:
+    return isinstance(cells, np.ndarray) and bool(np.all((low <= cells) & (cells <= high)))
+
+
+def _of_parts(sheet: Sheet, at: dict[str, str]) -> tuple[tuple[str, ...], Seconds] | None:
     """Return a clock of columns year, month, day, hour ..., or year, day of the year, hhmm (Campbell)."""
-    at = {key: n for n in sheet.columns for key, names in _FIELDS.items() if n.strip().lower() in names}
-    yearless = "year" not in at and {"month", "day", "hour"} <= at.keys()
-    if not yearless and not {"year", "hour"} <= at.keys() and not {"year", "hhmm"} <= at.keys():
+    dated = "doy" in at or {"month", "day"} <= at.keys()
+    if not dated or not ("hour" in at or {"year", "hhmm"} <= at.keys() or {"doy", "hhmm"} <= at.keys()):
         return None
-    if "doy" not in at and not {"month", "day"} <= at.keys():
-        return None
+    yearless = "year" not in at
     columns = {key: sheet.columns[n] for key, n in at.items()}
     for key, c in columns.items():
         if not isinstance(c, np.ndarray) or not np.isfinite(c).all() or (key != "second" and np.any(c % 1)):
@@ -275,18 +298,19 @@ def _of_parts(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
     whole = {key: c.astype(np.int64) for key, c in columns.items() if key != "second"}
     if yearless:  # a typical year
         whole["year"] = np.full(len(sheet), 2001)
-    months = ((whole["year"] - 1970) * 12 + (whole["month"] - 1 if "doy" not in at else 0)).astype(
-        "datetime64[M]"
-    )
-    days = months.astype("datetime64[D]").astype(np.int64) + whole["doy" if "doy" in at else "day"] - 1
+    days = clock.days(whole["year"], whole.get("month", 1), whole["day" if "month" in at else "doy"])
+    if "month" in at and "doy" in at and np.any(clock.days(whole["year"], 1, whole["doy"]) != days):
+        at = {key: n for key, n in at.items() if key != "doy"}  # a Julian day
     hour, minute = (
         (whole["hhmm"] // 100, whole["hhmm"] % 100)
         if "hhmm" in at
         else (whole["hour"], whole.get("minute", 0))
     )
+    if np.all(minute == 60):  # hours that are named by their end (EnergyPlus)  # noqa: PLR2004
+        minute = 0
     t = days * 86_400.0 + hour * 3600.0 + minute * 60.0 + columns.get("second", 0.0)
     start = str(np.datetime64(round(float(t[0]) * 1e3), "ms"))
-    used = [key for key in _FIELDS if key in at and not (key in ("month", "day") and "doy" in at)]
+    used = [key for key in _FIELDS if key in at]
     from_date = "of a year that is not stated" if yearless else f"from {start.replace('T', ' ')}"
     note = f"{', '.join(used)} put together, {from_date}"
     return tuple(at[key] for key in used), Seconds(
@@ -302,7 +326,8 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
         digits = hours[np.isfinite(hours)] if hours.dtype.kind == "f" else np.zeros(0)
         plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
         hourly = of_day.strip().lower() in _FIELDS["hour"]
-        if not plain or digits.max() > 235_959 or (named(of_day) <= 0 and not hourly):  # noqa: PLR2004
+        unnamed = _NO_NAME.match(of_day) and _NO_NAME.match(date) and np.any(np.diff(read[date].t) == 0)
+        if not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):  # noqa: PLR2004
             return None
         long = digits.max() > 2359 or "hhmmss" in of_day.lower()  # noqa: PLR2004
         if digits.max() <= 24 and "hhmm" not in of_day.lower():  # noqa: PLR2004
@@ -319,6 +344,8 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
             days = pc.replace_substring_regex(days, r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3")
     try:
         joined = clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
+        if _NO_NAME.match(of_day) and "evenly" not in _run(joined.t)[1]:
+            return None
         return replace(joined, note=joined.note + said)
     except (ClockError, pa.ArrowInvalid):
         return None

@@ -14,6 +14,7 @@ from thermoctl.units import SECONDS
 
 DAY_NS = 86_400_000_000_000
 DAY_S = 86_400.0
+YEAR_S = 365.2425 * DAY_S
 _MONTHS = dict(jan=1, feb=2, mar=3, apr=4, may=5, jun=6, jul=7, aug=8, sep=9, oct=10, nov=11, dec=12)
 _MONTHS |= dict(
     mär=3, mrz=3, mai=5, okt=10, dez=12, fév=2, fev=2, avr=4, jui=6, aoû=8, déc=12, ene=1, abr=4, ago=8
@@ -111,6 +112,21 @@ def later(start: str, seconds: float) -> str:
     """Return a date some seconds later."""
     date = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
     return f"{date}Z" if start.endswith("Z") else str(date)
+
+
+def of_one_year(seconds: Seconds) -> Seconds:
+    """Return the times of a typical year, whose months are from several years, as those of one year.
+
+    All steps are equal, but a few that are longer or shorter by whole years."""
+    steps = np.diff(seconds.t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    years = np.round((steps - usual) / YEAR_S)
+    jumps = (years != 0) & (np.abs(steps - usual - years * YEAR_S) < 2 * DAY_S)  # a 29th of February
+    even = usual > 0 and np.all(np.abs(steps[~jumps] - usual) <= 1e-6 * usual)  # noqa: PLR2004
+    if not even or not 0 < np.sum(jumps) < 12 or (steps > 0).all():  # noqa: PLR2004
+        return seconds
+    t = np.concatenate([seconds.t[:1], seconds.t[0] + np.cumsum(np.where(jumps, usual, steps))])
+    return replace(seconds, t=t, note=f"{seconds.note}; months of several years put together as one year")
 
 
 def grain(t: np.ndarray) -> float:
@@ -355,7 +371,7 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray, points: bool) -> tuple
             orders["year/month/day"] = (a + 2000, b, c)
         if named:
             orders = {"day.month.year": (year, b, a)}
-    by_order = {order: _days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
+    by_order = {order: days(*parts) * DAY_NS + clock for order, parts in orders.items() if _valid(*parts)}
     if points and "day.month.year" in by_order:
         by_order.pop("month/day/year", None)
     if not by_order:
@@ -402,6 +418,7 @@ def _valid(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> bool:
     return bool(np.all(day <= length))
 
 
-def _days(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> np.ndarray:
+def days(year: np.ndarray, month: np.ndarray | int, day: np.ndarray) -> np.ndarray:
+    """Return days since 1970; with month 1, `day` may be the day of the year."""
     months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
     return months.astype("datetime64[D]").astype(np.int64) + day - 1
