@@ -351,3 +351,172 @@ def test_a_sheet_with_times_is_read_before_one_with_a_counter(tmp_path):
     assert found.units == {"U": "V"} and any("sheet 'Records' read" in n for n in found.notes)
     assert list(read_recording(tmp_path / "both.xlsx", sheet="Cycles").columns) == ["Q"]
     assert list(read_recording(counted).columns) == ["Q"]
+
+
+def hours(count=48, years=None):
+    """Return hourly dates over the end of a January; `years`: of each month, as in a typical year."""
+    stamps = [datetime(2001, 1, 31) + timedelta(hours=k) for k in range(count)]
+    return [s.replace(year=(years or {}).get(s.month, 2001)) for s in stamps]
+
+
+@pytest.mark.parametrize("years", [{1: 1996, 2: 1983}, {1: 1983, 2: 1996}, {1: 1999, 2: 1998}])
+@pytest.mark.parametrize(
+    "names, row",
+    [
+        ("time(UTC)", "{s:%Y%m%d:%H%M}"),
+        ("Date (MM/DD/YYYY),Time (HH:MM)", "{s:%m/%d/%Y},{s:%H:%M}"),
+        ("Year,Month,Day,Hour,Minute", "{s:%Y,%m,%d,%H},30"),
+    ],
+)
+def test_the_months_of_a_typical_year_are_one_year(tmp_path, years, names, row):
+    stamps = hours(years=years)
+    text = rows(f"{names},T", *(f"{row.format(s=s)},{k}" for k, s in enumerate(stamps)))
+    found = read(tmp_path, text)
+    if years[2] > years[1]:  # forward: a gap of years, as any other
+        assert found.t[24] - found.t[23] > 4e8
+    else:
+        assert found.t.tolist() == [3600.0 * k for k in range(48)]
+        assert any("months of several years put together as one year" in n for n in found.notes)
+
+
+def test_two_runs_a_year_apart_are_no_typical_year(tmp_path):
+    text = rows("time,T", *(f"{y}-03-01 10:0{i}:30.{i * i},{i}" for y in (2026, 2025) for i in range(9)))
+    with pytest.raises(InputError, match="2 runs in one file"):
+        read(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    "head, row",
+    [
+        (
+            ["LOCATION,Town,-,NLD", "GROUND,3,.5,,10.1", "DATA PERIODS,1,1,Data"],
+            "{s:%Y,%m,%d},{n},60,?9?9,{k}",
+        ),
+        ([], "{s:%Y %m %d %H %M} {k}.5 20.1"),
+        ([" Slope", "   37.4  -88.3 105 m"], " {s:%Y %j %m %d %H %M} {k}.5 {k}"),
+        ([], "{s:%Y,%j,%H%M},{k}.5,3"),
+        ([], "{s:%j\t%H%M}\t{k}.5\t3"),
+        ([], "53131 {s:%Y%m%d %H%M} {k}.5 3"),
+        ([",Year,DOY,MST,T [deg C],P"], "0,{s:%Y},{s:%j},{n}00,{k},4"),
+    ],
+)
+def test_a_date_in_several_columns(tmp_path, head, row):
+    body = [row.format(s=s, k=k, n=s.hour + ("MST" not in str(head))) for k, s in enumerate(hours())]
+    found = read(tmp_path, rows(*head, *body))
+    np.testing.assert_allclose(found.t, 3600.0 * np.arange(48))
+    assert "%Y" not in row or found.meta["start"].startswith("2001-01-31T0")
+    assert any(np.allclose(c % 1, 0.5) or np.allclose(c, np.arange(48)) for c in found.columns.values())
+
+
+def test_numbers_without_names_are_no_date_by_chance(tmp_path):
+    with pytest.raises(InputError, match="no other that is a time"):
+        read(tmp_path, rows(*(f"2001,{1 + i % 12},{1 + i % 7},{i % 5},{i}.5" for i in range(40))))
+    with pytest.raises(InputError, match="no other that is a time"):  # a constant day and whole numbers
+        read(tmp_path, rows(*(f"20010301,{20 + i % 3},{i % 2}.5" for i in range(40))))
+
+
+def test_names_one_a_line_above_the_table(tmp_path):
+    head = ["%DataLog%", "Software : NSP", "Downloaded : 20260301 10:00:00"]
+    for name in ("Coolant", "Pressure", *(f"Channel of {i}" for i in range(150))):
+        head += [f"Channel : {name}", f"ID : {len(head)}", "Type : Raw", "DisplayMaxMin : 100,-100"]
+    body = [f"10:00:0{i}.500,{20 + i},{i}" + ",0" * 150 for i in range(6)]
+    found = read(tmp_path, rows(*head, "Log : 20260301 10:00:00", *body))
+    assert found.t.tolist() == [0, 1, 2, 3, 4, 5] and len(found.columns) == 152
+    assert found.columns["Coolant"].tolist() == [20, 21, 22, 23, 24, 25]
+    names = ["timeS: Time [seconds]", "t090C: Temperature [deg C]", "prDM: Pressure [bar]"]
+    head = [
+        "* FileName = cast.hex",
+        "# nquan = 3",
+        *(f"# name {i} = {n}" for i, n in enumerate(names)),
+        "*END*",
+    ]
+    found = read(tmp_path, rows(*head, *(f"   {i / 2}   2{i}.5   1.{i}" for i in range(6))))
+    assert found.units == {"t090C: Temperature": "degC", "prDM: Pressure": "bar"} and found.t[-1] == 2.5
+
+
+def test_units_stated_above_the_table_by_the_columns_names(tmp_path):
+    head = ["[#1],,,", "Humidity = %rh,,,", "Low Alarm Threshold = 35,,,", "[#2],,,", "Temperature = °C,,,"]
+    head += ["[#H],,,", "Date,Time,Humidity,Temperature", ",,,", "[#D],,,"]
+    found = read(tmp_path, rows(*head, *(f"24/01/2020,13:3{i}:00,37.{i},2{i}" for i in range(6))))
+    assert found.units == {"Humidity": "%", "Temperature": "degC"} and found.t[-1] == 300
+
+
+def test_statements_of_an_oscilloscope_are_no_header(tmp_path):
+    head = ["Memory Length,6,", "Trigger Level,1.6e+00,", "Source,CH1,", "Vertical Units,V,"]
+    head += ["Horizontal Units,S,", "Sampling Period,4e-07,", "Firmware,V1.14,", "Time, ,", "Mode,Detail,"]
+    body = [f"{-4e-4 + 4e-7 * i:.6e},{i}.5," for i in range(6)]
+    found = read(tmp_path, rows(*head, "Waveform Data,", *body))
+    assert list(found.columns) == ["column_2"] and found.units == {"column_2": "V"}
+    np.testing.assert_allclose(found.t, -4e-4 + 4e-7 * np.arange(6), atol=1e-12)
+
+
+@pytest.mark.parametrize("sep", [",", "\t"])
+def test_the_innermost_of_nested_tables(tmp_path, sep):
+    text = ["Cycle ID,Cap(mAh)", ",Step ID,Step Name", ",,Record ID,Voltage(V),Realtime", "1,9.5"]
+    for step in range(3):
+        text.append(f",{step + 1},Rest")
+        text += [f",,{3 * step + i},{3 + i / 8},2024-01-05 10:00:{3 * step + i:02d}" for i in range(3)]
+    found = read(tmp_path, rows(*text).replace(",", sep))
+    assert found.t.tolist() == [*range(9)] and found.columns["Voltage"].tolist() == 3 * [3, 3.125, 3.25]
+    assert any("innermost of 3 nested tables" in n for n in found.notes)
+    text[7] = ",,2,3.5;4,2024-01-05 10:00:02"
+    with pytest.raises(InputError, match=r"run.csv:8: .*'3.5;4'"):
+        read(tmp_path, rows(*text).replace(",", sep))
+    units = read(tmp_path, rows("time,T", ",degC", "0,20", "1,21"))
+    assert units.units == {"T": "degC"}
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_an_empty_line_of_one_column_is_a_missing_sample(tmp_path, end):
+    path = tmp_path / "run.csv"
+    path.write_bytes(end.join(["T [degC]", "20", "21", "", "", "24", "25", "26", "", ""]).encode())
+    found = read_recording(path, time="1s")
+    np.testing.assert_array_equal(found.columns["T"], [20, 21, np.nan, np.nan, 24, 25, 26])
+    path.write_bytes((2 * end).join(["T", "20", "21", "22"]).encode())  # each line ends twice
+    assert read_recording(path, time="1s").columns["T"].tolist() == [20, 21, 22]
+
+
+@pytest.mark.parametrize("unit, scale", [("[us]", 10**6), ("[ns]", 10**9), ("", 10**9)])
+def test_the_dates_of_a_data_frame_in_hdf5(tmp_path, unit, scale):
+    path, count = tmp_path / "run.h5", 1_772_359_200 * scale + scale * np.arange(9)
+    table = np.zeros(9, dtype=[("index", "i8"), ("values_block_0", "f8", (2,))])
+    table["index"], table["values_block_0"] = count, np.arange(18.0).reshape(9, 2)
+    with h5py.File(path, "w") as file:
+        for name in ("fixed/axis1", "series/index"):
+            file[name] = count
+            file[name].attrs["kind"], file[name].attrs["name"] = b"datetime64" + unit.encode(), b"N."
+        file["fixed/block0_items"], file["fixed/block0_values"] = [b"T", b"P"], table["values_block_0"]
+        file["series/values"], file["series"].attrs["name"] = np.arange(9.0), b"T"
+        file["frame/table"] = table
+        file["frame/table"].attrs["index_kind"] = b"datetime64" + unit.encode()
+        file["frame/table"].attrs["values_block_0_kind"] = b"(lp0\nVT\np1\naVP\np2\na."
+    for name in ("fixed", "series", "frame/table"):
+        found = read_recording(path, sheet=name)
+        assert found.t.tolist() == [*range(9)] and found.meta["start"].startswith("2026-03-01T10:00:00")
+        assert list(found.columns) == ["T", "P"][: 1 + (name != "series")]
+
+
+def test_a_table_of_other_rows_above(tmp_path):
+    head = ['"Channel","Name","Function","Range","Resolution","Scale"', '"101","","Temp","","C","1"']
+    head += ['"102","","DC Volts","AUTO","5.5","1"', '"Scan Control:"', '"Scan","Time","101 (C)","102 (VDC)"']
+    found = read(tmp_path, rows(*head, *(f"{i},3/14/2026 10:00:0{i}:123,20.{i},1.{i}" for i in range(1, 6))))
+    assert found.units == {"101": "degC", "102": "V"} and found.t.tolist() == [0, 1, 2, 3, 4]
+    head = ["latitude,longitude,elevation,offset", "52.5,13.4,38.0,0", "", "time,temperature_2m (°C)"]
+    found = read(tmp_path, rows(*head, *(f"2026-03-01T0{i}:00,{i}.5" for i in range(6))))
+    assert found.units == {"temperature_2m": "degC"} and found.t[-1] == 5 * 3600
+    head = ["*STARTTIME", "2026-03-01;10:00:00;", "*NAME", "TIME;T1", "*UNIT", ";°C", "*DATA"]
+    found = read(tmp_path, rows(*head, *(f"2026-03-01 10:00:0{i};2{i}.5" for i in range(6))))
+    assert found.units == {"T1": "degC"} and found.t[-1] == 5
+
+
+def test_a_unit_directly_behind_a_name(tmp_path):
+    text = rows(
+        "No.,Time,Temperature°C,Humidity%RH", *(f"{i},2026-03-01 10:0{i}:00,2{i},4{i}" for i in range(5))
+    )
+    assert read(tmp_path, text).units == {"Temperature": "degC", "Humidity": "%"}
+
+
+def test_columns_of_a_fixed_width_are_refused_with_a_remedy(tmp_path):
+    text = rows(" 12839 MIAMI FL -5 N 25 48", *(f" 620101{h:02d}00000000?0000?0" for h in range(1, 9)))
+    with pytest.raises(InputError, match="run.csv:1: .*fixed width: write them with commas"):
+        read(tmp_path, text)

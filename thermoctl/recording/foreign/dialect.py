@@ -35,6 +35,8 @@ FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (R
 _HEADER_END = re.compile(r"\*{3}End_of_Header\*{3}|Nb header lines\W+(\d+)")
 _TWO = re.compile(r"[-+]?[\d.]+(?: [-+]?[\d.]+)+$")  # numbers between single blanks
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
+_STATED = re.compile(r"[A-Za-z][^,;\t|:=]{0,60}?\s[:=]\s+\S")  # `Channel : RPM` above a table
+_DECIMALS = re.compile(r"[-+]?\d*[.,]\d+$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _KINDS = {"", *WORDS["kinds"].split()}
 
@@ -118,7 +120,7 @@ def _sample(path: Path, text: str) -> tuple[list[tuple[int, str]], list[tuple[in
     for number, line in enumerate(io.StringIO(text), 1):
         if not line.strip():
             continue
-        if is_comment(line):
+        if is_comment(line) or (not sample and _STATED.match(line)):
             comments.append((number, line.strip().lstrip("#% \t")))
             continue
         if _RULER.match(line):
@@ -208,7 +210,7 @@ def _separator(
         shown = sample[0][1][:60]
         raise InputError(
             f"{path}:{sample[0][0]}: '{shown}': no columns; a header line and rows separated by comma, "
-            "semicolon, tab, | or blanks were expected"
+            "semicolon, tab, | or blanks were expected (columns of a fixed width: write them with commas)"
         )
     return best[1:]
 
@@ -251,6 +253,9 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
         return 2 * right >= len(there) > 0 and 2 * right >= max(1, len(there))
 
     data = [is_data(c) for _, c in rows]
+    after = [*(d and len(c) == width for d, (_, c) in zip(data, rows, strict=True)), True][1:]
+    # A wider row is of another table above, unless a row of this one follows.
+    data = [d and (a or len(c) <= width) for d, a, (_, c) in zip(data, after, rows, strict=True)]
     # Without a word in the first column a row of a header can look like data; then the next row has to, too.
     enough = 1 if expected[:1] == [0] else 2
     for i, good in enumerate(data):
@@ -267,7 +272,9 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
 def _longer_once(rows: list[tuple[int, list[str]]], width: int) -> bool:
     """Return whether only the header and the first row have further cells: a serial number (Lascar)."""
     lengths = [len(c) for _, c in rows]
-    return lengths[:1] == lengths[1:2] != [width] and lengths[0] > width == max(lengths[2:], default=0)
+    if not lengths[:1] == lengths[1:2] != [width] or not lengths[0] > width == max(lengths[2:], default=0):
+        return False
+    return list(map(_kind, rows[1][1][:width])) == list(map(_kind, rows[2][1]))
 
 
 def _bare(cell: str) -> str:
@@ -282,7 +289,7 @@ def _is_units(cells: list[str], above: list[str]) -> bool:
     """Return whether most cells of a line are units, and the line above it can be the header."""
     bare = [_bare(c) for c in cells]
     words = [c for c in bare if c and not is_number(c) and c.lower() not in ("ts", "rn") and named(c) == 0]
-    right = sum(known(c) for c in bare)
+    right = sum(known(c) and not re.fullmatch("[A-Z][0-9]", c) for c in bare)  # T1 and V2 are names
     names = sum(bool(c) and (not is_number(c) or re.fullmatch(r"\d{1,3}", c) is not None) for c in above)
     return (
         all(len(c) <= UNIT_LENGTH for c in bare[1:])
@@ -305,13 +312,12 @@ def _header(
     """Return names, units, the header's cells, and the lines that they were taken from."""
     if paired := _paired(head, width, data):
         return paired
-    lines_of = [(n, c) for n, c in head if _fits(c, width, data)][-HEAD_LINES:]
-    if not lines_of or (lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1):
-        commented = _commented(comments, separator, width, head)
-        lines_of = [commented] if commented else lines_of
+    lines_of = _header_lines(head, comments, separator, width, data)
     if not lines_of:
         notes.append("no header: the columns are called column_1, column_2 ...")
-        return tuple(f"column_{i + 1}" for i in range(width)), {}, (), set()
+        empty = {i for i in range(width) if data and not any(row[i] for row in data)}
+        names = [f"\0{i}" if i in empty else f"column_{i + 1}" for i in range(width)]
+        return tuple(names), aligned(facts, names, {}), (), set()
     if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):  # noqa: PLR2004
         lines_of.pop()  # the line below the units (Origin)
     below: list[tuple[int, list[str]]] = []
@@ -338,6 +344,28 @@ def _header(
             take_below(lines_of[-1][1], row, facts)
     units |= aligned(facts, names, units)
     return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
+
+
+def _header_lines(
+    head: list[tuple[int, list[str]]],
+    comments: list[tuple[int, str]],
+    separator: str,
+    width: int,
+    data: list[list[str]],
+) -> list[tuple[int, list[str]]]:
+    """Return the lines that can be the header, with those of units below it; none without a header."""
+    fitting = [(n, c) for n, c in head if _fits(c, width, data)]
+    lines_of = ([f for f in fitting if len(f[1]) > 1] or fitting)[-HEAD_LINES:]  # a lone word is a title
+    parted = bool(lines_of) and lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1
+    stated = [c for _, c in fitting if len(list(filter(None, c))) == 2 and is_number(c[1])]  # noqa: PLR2004
+    if parted and len(stated) > 1:
+        lines_of = []  # statements such as `Sampling Period,4e-7`, and a title above the rows (GW Instek)
+    if not lines_of or parted:
+        commented = _commented(comments, separator, width, head) or (
+            not lines_of and _listed(comments, width)
+        )
+        lines_of = [commented] if commented else lines_of
+    return lines_of
 
 
 def _slashed(cells: list[str]) -> bool:
@@ -376,6 +404,8 @@ def _fits(cells: list[str], width: int, data: list[list[str]]) -> bool:
         filled -= 1
     if filled < 2 and width > 2:  # noqa: PLR2004
         return False
+    if 2 * sum(bool(_DECIMALS.match(c)) for c in cells) > filled:
+        return False  # a row of values above the table (EnergyPlus)
     more = {c.lower() for c in cells[width:]}
     known_more = len(cells) > width and (
         more <= {"start", "increment", "comment", ""} or all(is_number(c) or not c for c in more)
@@ -430,8 +460,23 @@ def _commented(
     for number, text in reversed(comments):
         for sep in (separator, ",", ";", "\t", "  ", " "):
             cells = cells_of(text, sep)
-            if len(cells) == width and not any(_kind(c) in "t" for c in cells):
+            if len(cells) == width and not any(_kind(c) in "t" for c in cells) and not _STATED.match(text):
                 return number, cells
+    return None
+
+
+def _listed(comments: list[tuple[int, str]], width: int) -> tuple[int, list[str]] | None:
+    """Return names that stand above the table one a line: `Channel : RPM`, `name 0 = timeS: Time`.
+
+    Their key stands once for each column; a time in the first one may have none."""
+    by_key: dict[str, list[str]] = {}
+    for _, text in comments:
+        if match := re.match(r"([A-Za-z][A-Za-z _]*?)\s*\d*\s*[:=]\s*(.+)$", text):
+            by_key.setdefault(match[1].lower(), []).append(match[2])
+    for names in by_key.values():
+        timed = ["Time"] * (width - len(names)) + names
+        if len(names) > 1 and len(set(timed)) == width <= len(names) + 1 and not any(map(is_number, names)):
+            return comments[-1][0], timed
     return None
 
 

@@ -24,11 +24,10 @@ _VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s
 def facts_of(above: list[tuple[int, str]], separator: str) -> dict[str, list[str]]:
     """Return the statements of the lines above the header: `Delta_X <tab> 0.1`, `Interval: 0.5 s`."""
     facts: dict[str, list[str]] = {}
+    sep = separator if separator.strip() or separator == "\t" else "\t"
     for _, line in above:
-        cells = [
-            c.strip().strip('"')
-            for c in line.split(separator if separator.strip() or separator == "\t" else "\t")
-        ]
+        line = line.rstrip(f" {sep}")
+        cells = [c.strip().strip('"') for c in line.split(sep)]
         if len(cells) < 2 and (match := re.match(r"([^:=]{2,40})[:=]\s*(.+)$", line)):  # noqa: PLR2004
             cells = [match[1].strip(), match[2].strip()]
         elif len(cells) > 1 and cells[0].endswith((":", "=")):
@@ -47,7 +46,12 @@ def take_below(cells: list[str], row: list[str], facts: dict[str, list[str]]) ->
 
 def aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str]) -> dict[str, str]:
     """Return units of lines above the header that name them by column: LVM, oscilloscopes."""
-    found: dict[str, str] = {}
+    own = {n: facts[n.lower()] for n in names if n.lower() in facts}  # `Humidity = %rh` (Rotronic)
+    found = {
+        n: str(spelled(unit, n))
+        for n, (unit, *more) in own.items()
+        if not more and known(unit) and not {n} & units.keys() and unit not in names
+    }
     for key, values in facts.items():
         if re.search(r"(?i)^(y_?|vert\w*[ _]?|v)?(unit|einheit)", key) and any(
             known(_own(v)) for v in values

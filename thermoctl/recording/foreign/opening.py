@@ -157,7 +157,12 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
         notes.append("whole lines stand in quotes; read without them")
+    text, depth = _innermost(text)
+    if depth:
+        notes.append(f"the rows of the innermost of {depth + 1} nested tables read")
     dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
+    if len(dialect.names) == 1:
+        text = _with_empty_lines(text, dialect, notes)
     how.trace.append(f"read as: {_described(dialect)}")
     notes += dialect.notes
 
@@ -171,6 +176,30 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     stated = _stated(sheet, dialect)
     stated[0].again = closely  # reading cell by cell gives an error with the line
     return stated
+
+
+def _innermost(text: bytes) -> tuple[bytes, int]:
+    """Return the rows of the innermost of nested tables (Neware), and how deep they are.
+
+    They begin with most separators. The text begins with the headers and first rows of all tables."""
+    shown = [re.match(rb"[,;\t]*", line)[0] for line in text[:HEAD].splitlines()[:8]]  # type: ignore[index]
+    for depth in (2, 1):
+        levels = [len(s) for s in shown[: 2 * depth + 2]]
+        if levels == 2 * [*range(depth + 1)]:
+            begin = re.escape(shown[depth])
+            other = rb"(?m)^(?!" + begin + rb"[^,;\t\r\n]).*$"
+            return re.sub(rb"(?m)^" + begin, b"", re.sub(other, b"", text)), depth
+    return text, 0
+
+
+def _with_empty_lines(text: bytes, dialect: Dialect, notes: list[str]) -> bytes:
+    """Return the text of one column with "nan" in its empty lines, so that later rows keep their times."""
+    body = _body(text, dialect)
+    rows = re.sub(rb"(?<=\n)\r?(?=\n)", b"nan", body.strip())
+    if not 0 < 2 * rows.count(b"nan\n") < rows.count(b"\n"):  # none, or each line ends twice
+        return text
+    notes.append("empty lines between the rows read as no value")
+    return text.removesuffix(body) + rows + b"\n"
 
 
 def _described(dialect: Dialect) -> str:
@@ -263,7 +292,10 @@ def _slow(path: Path, text: bytes, dialect: Dialect) -> Sheet:
         raise InputError(f"{path}: no rows; at least one sample was expected")
     if odd and min(odd)[0] < rows[-1][0]:
         line, cells = min(odd)
-        raise InputError(f"{path}:{line}: {len(cells)} cells; {width} as in the header were expected")
+        raise InputError(
+            f"{path}:{line}: {len(cells)} cells; {width} as in the header were expected "
+            "(quote a cell that holds the separator; delete a line that is no row)"
+        )
     if odd:
         notes.append(
             f"line{'s' if len(odd) > 1 else ''} {', '.join(str(n) for n, _ in odd[:3])} at the end left out: "

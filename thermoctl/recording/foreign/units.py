@@ -22,11 +22,11 @@ _SYMBOL = (
 )
 ANGLES = (), dimension("Hz")  # dimensions in which pint takes a radian for 1 and a turn for 2 pi
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
-_UNIT = re.compile(rf"1|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
+_UNIT = re.compile(rf"1$|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
 _LAST = re.compile(
-    r"(.*[^\s,(\[/])\s+(°\s?[CF]|℃|℉|[Dd]eg\.? ?[CF])$|(CH\d+)([VA])$"
-)  # `Temp. °C`; CH1V of an oscilloscope
+    r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$"
+)  # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope
 _SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
 
 
@@ -90,7 +90,7 @@ def split_words(header: str) -> tuple[str, str | None]:
         r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)", "", header.strip()
     )
     if match := _LAST.match(text):
-        name, unit = match[1] or match[3], match[2] or match[4]
+        name, unit = match[1] or match[4], match[2] or match[3] or match[5]
         return (text, None) if re.search(r"\bin$", name) else (name, spelled(unit, name))
     name, unit = split_unit(text)
     if (
