@@ -1,5 +1,6 @@
 """Files are written whole or not at all; links, modes and devices stay what they are."""
 
+import errno
 import os
 import stat
 import subprocess
@@ -56,6 +57,30 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, name, why):
         write_text(tmp_path / name, "x", "try another")
     with pytest.raises(WriteError, match="Not a directory"):
         make_folder(tmp_path / "file" / "below")
+
+
+@pytest.mark.parametrize(
+    "number, advice",
+    [
+        (errno.ENOSPC, "No space left on device; free some space and run this again"),
+        (errno.EDQUOT, "free some space of the user's quota and run this again"),
+        (errno.EROFS, "Read-only file system; .*mount it for writing"),
+        (errno.EACCES, "Permission denied; give the user the right to write there"),
+        (errno.EIO, "Input/output error; .*the disk may be failing"),
+    ],
+)
+def test_each_error_of_a_disk_has_a_remedy_of_its_own(tmp_path, number, advice):
+    with pytest.raises(WriteError, match=advice), whole_file(tmp_path / "a.txt"):
+        raise OSError(number, "")
+
+
+def test_a_file_in_the_way_and_a_long_name_have_remedies(tmp_path):
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(WriteError, match="a file stands where a folder belongs: move it"):
+            make_folder(place)
+    with pytest.raises(WriteError, match="File name too long; give a shorter path"):
+        make_folder(tmp_path / ("x" * 300))
 
 
 def test_a_device_or_a_pipe_is_written_directly():

@@ -81,7 +81,10 @@ def test_a_disk_that_another_program_fills(tmp_path):
                 fill.write(bytes(4096))
         ((unsaved,), _) = wait(lambda: daemon.ask("status")["unsaved"], "a full disk is not reported")
         rows = len(read_table(first))
-        assert unsaved["what"] == "recording" and unsaved["why"] == f"{small}/rec: No space left on device"
+        assert (
+            unsaved["what"] == "recording"
+            and unsaved["why"] == f"{small}/rec: No space left on device; free some space"
+        )
         said = subprocess.run(
             [sys.executable, "-m", "thermoctl.cli", "status", "--config", str(daemon.config)],
             capture_output=True,

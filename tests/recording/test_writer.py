@@ -229,7 +229,7 @@ def test_a_full_disk_deletes_nothing_and_leaves_no_empty_file(tmp_path, monkeypa
             writer = RecordingWriter(settings(tmp_path), {}, log=said.append, clock=lambda: clock.now)
             assert feed(writer, ticks(1002, 2000 + again)) + writer.close() == 1002
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
-    assert set(said) == {f"{tmp_path}: No space left on device"}
+    assert set(said) == {f"{tmp_path}: No space left on device; free some space"}
 
 
 def test_a_recording_is_readable_from_its_first_moment_and_names_the_time(tmp_path):
@@ -244,4 +244,12 @@ def test_a_recording_that_was_deleted_is_not_written_on(tmp_path):
     assert feed(writer, ticks(1002)) == 0 and said == [""]
     writer.path.unlink()
     assert feed(writer, ticks(1002, 1002)) > 0
-    assert writer.close() >= 0 and said[1] == f"{tmp_path}: No such file or directory"
+    assert writer.close() >= 0 and said[1].startswith(f"{tmp_path}: No such file or directory; ")
+
+
+def test_a_file_where_the_folder_belongs_is_no_full_disk(tmp_path):
+    (tmp_path / "rec").write_text("")
+    said = []
+    writer = RecordingWriter(settings(tmp_path / "rec"), {}, log=said.append)
+    assert "a file stands where a folder belongs" in said[0] and "space" not in said[0]
+    assert feed(writer, ticks(1002, 1002)) + writer.close() == 1002

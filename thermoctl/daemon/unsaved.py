@@ -21,7 +21,7 @@ _EVENTS = {
 }
 # Largest number of characters of a reason; of a longer one the end is kept, which names the error.
 LONGEST = 400
-REMEDY = "free some space or mend the disk; it is tried again by itself"
+REMEDY = "it is tried again by itself"
 
 
 class Unsaved:

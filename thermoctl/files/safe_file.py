@@ -22,14 +22,29 @@ from thermoctl.files.yamlfile import InputError
 
 SUFFIX = ".part"
 STALE_S = 60.0  # a younger temporary file may belong to a program that has not locked it yet
-_FULL = (errno.ENOSPC, errno.EDQUOT)
+MAX_SOCKET = 107
+"""Largest number of bytes of the path of a Unix socket (sun_path of unix(7) without its end)."""
+_IN_THE_WAY = "a file stands where a folder belongs: move it, or give another path"
+_REMEDIES = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space of the user's quota",
+    errno.EIO: "the disk may be failing: look at `dmesg`",
+    errno.EROFS: "the file system is read-only: mount it for writing, or give another path",
+    errno.EACCES: "give the user the right to write there, or give another path",
+    errno.EPERM: "give the user the right to write there, or give another path",
+    errno.ENOTDIR: _IN_THE_WAY,
+    errno.EEXIST: _IN_THE_WAY,
+    errno.EISDIR: "a folder has this name: give another path",
+    errno.ENOENT: "make the folder first, or give another path",
+    errno.ENAMETOOLONG: "give a shorter path",
+}
 
 
 class WriteError(InputError):
     """A file that could not be written; `why`: its path and the system's reason."""
 
     def __init__(self, path: str | Path, error: OSError, remedy: str):
-        self.why = f"{path}: {reason(error)}"
+        self.why = f"{path}: {reason(error)}; {remedy_of(error)}"
         kept = "; it is as it was before" if os.path.isfile(path) else ""
         super().__init__(f"{path}: cannot be written: {reason(error)}{kept}{'; ' if remedy else ''}{remedy}")
 
@@ -168,6 +183,22 @@ def reason(e: OSError) -> str:
     return os.strerror(e.errno) if e.errno else str(e).splitlines()[0]
 
 
+def long_socket(path: str | Path, option: str) -> str:
+    """Return a sentence where the path is longer than one of a Unix socket may be; '' else."""
+    size = len(os.fsencode(path))
+    if size <= MAX_SOCKET:
+        return ""
+    return (
+        f"{path}: {size} bytes; a socket's path of at most {MAX_SOCKET} was expected, as the system allows; give a "
+        f"shorter {option}, such as /run/thermoctl/rig"
+    )
+
+
+def remedy_of(e: OSError) -> str:
+    """Return advice for an error of writing a file."""
+    return _REMEDIES.get(e.errno or 0, "give another path")
+
+
 @contextlib.contextmanager
 def _reported(path: str | Path, remedy: str) -> Iterator[None]:
     """Turn an OSError into an InputError of one line that names `path`."""
@@ -176,11 +207,11 @@ def _reported(path: str | Path, remedy: str) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as e:
-        if e.errno in _FULL:
-            remedy = "free some space and run this again"
+        if e.errno in (errno.ENOSPC, errno.EDQUOT):
+            remedy = f"{remedy_of(e)} and run this again"
         elif e.errno == errno.EIO:
             remedy = ""
-        raise WriteError(path, e, remedy) from None
+        raise WriteError(path, e, remedy or remedy_of(e)) from None
 
 
 def _is_device(path: str | Path) -> bool:

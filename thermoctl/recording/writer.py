@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 import pyarrow as pa
 
-from thermoctl.files.safe_file import part_file, reason, sync_folder
+from thermoctl.files.safe_file import part_file, reason, remedy_of, sync_folder
 from thermoctl.recording.stream import CRC, END, checksums
 from thermoctl.rig.signals import SIGNALS, Signal
 
@@ -339,7 +339,7 @@ class RecordingWriter:
         )
 
     def _fail(self, e: OSError) -> None:
-        self.error = f"{self.directory}: {reason(e)}"
+        self.error = f"{self.directory}: {reason(e)}; {remedy_of(e)}"
         self._failed = self.clock()
         self.log(self.error)
         with contextlib.suppress(OSError):  # often the few bytes of the tier still fit
