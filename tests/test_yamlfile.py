@@ -1,6 +1,7 @@
 """`Section`, the one typed reader of mappings: values come out typed, each mistake with its place and what was expected."""
 
 import math
+import re
 
 import pytest
 
@@ -70,3 +71,32 @@ def test_each_mistake_has_its_place(read, message):
 def test_a_number_is_finite(number):
     with pytest.raises(InputError, match="a number was expected"):
         section(f"gain: {number}").number("gain")
+
+
+@pytest.mark.parametrize(
+    "text, says",
+    [
+        ("a: {value: 3,5}", ":1:12: '3,5' has a decimal comma; write 3.5"),
+        ("a: {b: 1, value: -3,5, unit: K}", ":1:18: '-3,5' has a decimal comma; write -3.5"),
+        ("a: {value: 3,5e3}", "write 3.5e3"),
+        ("a: {value: 3,5 ms}", "write 3.5 ms"),
+        ('{"a": {"value": 3,5}}', "write 3.5"),
+    ],
+)
+def test_a_decimal_comma_in_braces_is_no_key(text, says):
+    with pytest.raises(InputError, match=re.escape(says)):
+        loads(text)
+
+
+def test_a_decimal_comma_elsewhere():
+    for text in ("gain: 3,5", "gain: '3,5'", "gain: 3,5 ms"):
+        with pytest.raises(InputError, match="gain: '3,5.*' has a decimal comma; write 3.5"):
+            section(text).number("gain")
+    with pytest.raises(InputError, match="two numbers .*write decimals with a point"):
+        section("gain: [1,5, 2,5]").interval("gain")
+    assert loads("{a: 1.5,b: 2, c: [1,5], d: {e: 3,4: 1}}").plain() == {
+        "a": 1.5,
+        "b": 2,
+        "c": [1, 5],
+        "d": {"e": 3, "4": 1},
+    }

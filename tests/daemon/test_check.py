@@ -177,3 +177,17 @@ def test_the_template_of_a_rig_is_not_good(capsys):
     assert main(["check", str(CONFIG / "rig.yaml")]) == 1
     out = capsys.readouterr().out
     assert re.search(r"^error: .*port: 'XXXXXXXX'", out, re.MULTILINE) and "good" not in out
+
+
+@pytest.mark.parametrize("size, fits", [(107, True), (108, False)])
+def test_a_socket_path_that_the_system_does_not_allow(config, capsys, size, fits):
+    folder = str(config.parent)
+    path = folder + "/" + "s" * (size - len(folder) - 6) + ".sock"
+    assert len(path) == size
+    change(config, ("path: ../run/wire.sock", f"path: {path}"))
+    assert main(["check", "--config", str(config)]) == (0 if fits else 1)
+    said = capsys.readouterr().out
+    assert fits or f"error: {path}: 108 bytes; a socket's path of at most 107 was expected" in said
+    for command in () if fits else ("run", "status"):
+        assert main([command, "--config", str(config)]) != 0
+        assert "give a shorter socket.path" in capsys.readouterr().err

@@ -23,7 +23,16 @@ from typing import Any
 import yaml
 
 from thermoctl.control.limits import Limits
-from thermoctl.files.yamlfile import InputError, Node, Section, kind_of, load, number_of, suggest
+from thermoctl.files.yamlfile import (
+    InputError,
+    Node,
+    Section,
+    decimal_comma,
+    kind_of,
+    load,
+    number_of,
+    suggest,
+)
 from thermoctl.rig.channels import (
     CODES,
     DEFAULT,
@@ -639,7 +648,8 @@ def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
     try:
         value = Fraction(number)
     except (ValueError, ZeroDivisionError):
-        raise node.error(f"{label}: a number in {unit or 'no unit'} was expected, not '{text}'") from None
+        said = decimal_comma(text) or f"a number in {unit or 'no unit'} was expected, not '{text}'"
+        raise node.error(f"{label}: {said}") from None
     try:
         if (factor := ratio(given, unit)) is not None:
             return float(value * factor)

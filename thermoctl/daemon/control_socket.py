@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError
 
 
@@ -32,6 +33,8 @@ class Connection:
 
     def __init__(self, path: Path | str, timeout_s: float = 3.0):
         self.path, self.timeout_s = path, timeout_s
+        if long := long_socket(path, "socket.path"):
+            raise InputError(long)
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.socket.settimeout(timeout_s)
         with self._answering():

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError
 
 # `hold` retries for this time. To test the lock, `holder` in another process takes it for a shorter time.
@@ -28,6 +29,8 @@ def hold(settings: Settings) -> int:
     Raises InputError when another process holds the rig.
     """
     path = lock_path(settings)
+    if long := long_socket(settings.socket.path, "socket.path"):
+        raise InputError(long)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

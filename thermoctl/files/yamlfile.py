@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -149,6 +150,7 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
         raise InputError(f"{place}: nested deeper than {MAX_DEPTH} levels")
     if isinstance(node, yaml.MappingNode):
         out: dict[str, Node] = {}
+        _refuse_decimal_comma(node, file)
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise InputError(f"{place}: a key must be a plain word")
@@ -176,6 +178,22 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
         except (ValueError, yaml.YAMLError):
             raise InputError(f"{place}: '{node.value}' cannot be read as {kind}") from None
     raise InputError(f"{place}: the tag {node.tag} is not allowed here")
+
+
+def _refuse_decimal_comma(node: yaml.MappingNode, file: str) -> None:
+    """Raise InputError for `{value: 3,5}`, in which YAML takes 5 for a key without a value."""
+    for (_, before), (key, value) in pairwise(node.value):
+        begin, end = key.start_mark, before.end_mark
+        adjacent = begin.line == end.line and begin.column == end.column + 1
+        if adjacent and not value.value and (said := decimal_comma(f"{before.value},{key.value}")):
+            raise InputError(f"{file}:{before.start_mark.line + 1}:{before.start_mark.column + 1}: {said}")
+
+
+def decimal_comma(text: str) -> str:
+    """Return a sentence where a text is a number with a decimal comma, also with a unit; '' else."""
+    if not re.fullmatch(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?: .*)?", text):
+        return ""
+    return f"'{text}' has a decimal comma; write {text.replace(',', '.')}"
 
 
 class Section:
@@ -265,7 +283,9 @@ class Section:
             return -math.inf, math.inf
         label = self.label(key)
         if not isinstance(node.value, list) or len(node.value) != 2:
-            raise node.error(f"{label}: two numbers [low, high] were expected, found {kind_of(node)}")
+            more = isinstance(node.value, list) and len(node.value) > 2
+            hint = " of more items (write decimals with a point: 0.5)" if more else ""
+            raise node.error(f"{label}: two numbers [low, high] were expected, found {kind_of(node)}{hint}")
         low, high = (number_of(n, label) for n in node.value)
         if not low < high:
             raise node.error(
@@ -335,6 +355,8 @@ def number_of(
     value = _hexadecimal(node.value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
         in_unit = f" in {unit}" if unit else ""
+        if said := decimal_comma(str(value)):
+            raise node.error(f"{label}: {said}")
         raise node.error(f"{label}: a number{in_unit} was expected, found {kind_of(node)}")
     if not low <= value <= high:
         raise node.error(f"{label}: {value:g} is outside {low:g} .. {high:g} {unit}".rstrip())

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import TextIO
 
 from thermoctl.configuration.settings import Settings
+from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.rig.channels import AxesChannels
 from thermoctl_hal.base.binding import Binding
@@ -226,6 +227,8 @@ class VirtualRig:
 
 
 def _listen(path: Path) -> socket.socket:
+    if long := long_socket(path, "hal.run_dir"):
+        raise InputError(long)
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     with contextlib.suppress(FileNotFoundError):
         tell(path, "help")

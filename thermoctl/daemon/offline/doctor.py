@@ -32,6 +32,7 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.extras import lacking
+from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.writer import disk_warning
 from thermoctl.rig.channels import AMPLIFIER_STATES
@@ -74,6 +75,8 @@ def _check(settings: Settings) -> int:
         reported = list(obstacles(settings))
         warnings = power_warning(settings), priority_warning(settings), *device_warnings(settings)
         reported += [(False, w) for w in warnings if w]
+    if long := long_socket(settings.socket.path, "socket.path"):
+        reported.append((True, long))
     for in_the_way, line in reported:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
     bad = any(in_the_way for in_the_way, _ in reported)
