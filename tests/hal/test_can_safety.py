@@ -392,6 +392,65 @@ def test_objects_that_the_eds_has_not_are_told_by_check(tmp_path, how, message):
     assert "\n" not in str(e.value)
 
 
+def altered_eds(folder, at, more, start_up=""):
+    """Bind the shipped drive with lines `more` in section `at` of its EDS file."""
+    for name in ("drive-cia402.eds", "drive-cia402.yaml"):
+        text = (CONFIG / "devices" / name).read_text()
+        if name.endswith("eds"):
+            head, section, rest = text.partition(f"[{at}]\n")
+            text = head + section + more + "\n" + rest
+        else:
+            text = text.replace("  watchdog_s: 0.1 ", start_up + "  watchdog_s: 0.1 ")
+        (folder / name).write_text(text)
+    rig = "{profile: drive-cia402.yaml, port: 'virtual:eds', roles: {state: amplifier_state}}"
+    return Cia402Device(bind(yamlfile.loads(rig), folder))
+
+
+MODES = "  start_up: [{index: 0x6060, value: 10}]\n"
+
+
+@pytest.mark.parametrize(
+    "at, more, start_up, message",
+    [
+        ("6078", "AccessType=wo", "", "transmit: .*object 0x6078 .*has AccessType=wo: it cannot be sent"),
+        ("2071", "AccessType=ro", "", "command: .*object 0x2071 .*has AccessType=ro: it cannot be written"),
+        ("2071", "AccessType = CONST ; fixed", "", "has AccessType=const: it cannot be written"),
+        ("6060", "AccessType=ro", MODES, "start_up: .*AccessType=ro"),
+        (
+            "6060",
+            "LowLimit=0\nHighLimit=8",
+            MODES,
+            "0x6060 takes 0 .. 8 .LowLimit, HighLimit., 10 is outside",
+        ),
+        (
+            "2071",
+            "LowLimit=0xFFF0BDC0\nHighLimit=1000000",
+            "",
+            "0x2071 takes -1000000 .. 1000000 .*-2.5e.06 .. 2.5e.06 is",
+        ),
+        ("2071", "HighLimit=2000000", "", "takes -inf .. 2000000"),
+    ],
+)
+def test_access_and_limits_of_the_eds_are_heeded(tmp_path, at, more, start_up, message):
+    with pytest.raises(InputError, match=message) as e:
+        altered_eds(tmp_path, at, more, start_up)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    "at, more",
+    [
+        ("2071", "LowLimit=-2500000\nHighLimit=2500000"),
+        ("2071", "LowLimit=0x80000000\nHighLimit=0x7FFFFFFF"),
+        ("2071", "LowLimit=0\nHighLimit=0"),
+        ("2071", "LowLimit=$NODEID\nHighLimit="),
+        ("6078", "AccessType=rwr"),
+    ],
+)
+def test_limits_that_allow_the_command_or_say_nothing(tmp_path, at, more):
+    assert altered_eds(tmp_path, at, more, MODES)
+
+
 class Adapter:
     """The other end of a Lawicel adapter's line, in bytes."""
 

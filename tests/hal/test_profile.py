@@ -132,6 +132,42 @@ def test_mistakes_in_a_binding_are_named(text, message):
         bind(yamlfile.loads(text), CONFIG / "devices")
 
 
+def test_a_unit_of_modbus_on_a_line_is_not_the_broadcast(tmp_path):
+    def bound(more, profile="meter-modbus.yaml", folder=CONFIG / "devices"):
+        return bind(yamlfile.loads(f"{{profile: {profile}, roles: {{}}, {more}}}"), folder)
+
+    with pytest.raises(InputError, match="address: 0 is the broadcast, which no unit answers.*1 .. 247"):
+        bound("port: 'rtu:/dev/ttyUSB0', address: 0")
+    assert bound("port: 'tcp:10.0.0.5:502', address: 0").address == 0
+    text = (CONFIG / "devices/meter-modbus.yaml").read_text()
+    (tmp_path / "meter.yaml").write_text(text.replace("unit_id: 2", "unit_id: 0"))
+    with pytest.raises(InputError, match="address: 0 is the broadcast"):
+        bound("port: 'rtu:/dev/ttyUSB0'", "meter.yaml", tmp_path)
+    assert bound("port: 'rtu:/dev/ttyUSB0', address: 7", "meter.yaml", tmp_path).address == 7
+
+
+def test_a_message_of_j1939_of_several_frames_is_refused(tmp_path):
+    from thermoctl_hal.can.dbc import DbcDevice
+
+    dbc = """VERSION ""
+BU_: ECU
+BO_ 2566834942 LONG: 19 ECU
+ SG_ T : 0|8@1+ (1,-40) [-40|210] "degC" X
+BO_ 2566843134 SHORT: 8 ECU
+ SG_ U : 0|8@1+ (1,-40) [-40|210] "degC" X
+"""
+    (tmp_path / "engine.dbc").write_text(dbc)
+    (tmp_path / "engine.yaml").write_text(
+        "format: thermoctl-device/1\nvendor: x\nmodel: y\nbus: can-dbc\ndbc: engine.dbc\nchannels:\n"
+        "  t: {message: LONG, signal: T, unit: degC, range: [-40, 210], rate_hz: 1, stale_after_s: 3}\n"
+        "  u: {message: SHORT, signal: U, unit: degC, range: [-40, 210], rate_hz: 1, stale_after_s: 3}\n"
+    )
+    rig = "{profile: engine.yaml, port: 'virtual:j1939', roles: {%s: coil_c}}"
+    assert DbcDevice(bind(yamlfile.loads(rig % "u"), tmp_path))
+    with pytest.raises(InputError, match="engine.yaml:7:.*LONG has 19 bytes: J1939 sends it in parts"):
+        DbcDevice(bind(yamlfile.loads(rig % "t"), tmp_path))
+
+
 def test_a_binding_may_loosen_the_limits_of_its_profile():
     drive = "profile: drive-cia402.yaml, port: 'slcan:x', roles: {state: amplifier_state}"
     tight, loose = (

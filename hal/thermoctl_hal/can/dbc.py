@@ -47,6 +47,12 @@ class DbcDevice(Device):
             can_id = spec.can_id(source.message, binding.address)
             if spec.is_j1939(source.message, binding.address):
                 can_id = pgn_of(can_id)
+                if message.length > CLASSIC_BYTES:
+                    raise InputError(
+                        f"{b.channel.place}: message: {message.name} has {message.length} bytes: J1939 sends it in "
+                        f"parts (transport protocol), which are not put together; bind a message of up to "
+                        f"{CLASSIC_BYTES} bytes, or let a gateway send the signal in one"
+                    )
             entry = self._messages.setdefault(can_id, (message, [], []))
             if entry[0] is not message:
                 raise InputError(

@@ -1,11 +1,12 @@
 """Read the types of objects from an EDS file (CiA 306); only those that a profile names must be sound.
 
-Of each section `[6041]` or `[1A00sub3]` only ParameterName, ObjectType and DataType count. Other lines, and
-faults in them, are passed over with one warning.
+Of each section `[6041]` or `[1A00sub3]` name, ObjectType, DataType, AccessType and the limits count. Other
+lines, and faults in them, are passed over with one warning.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -42,6 +43,26 @@ class Entry:
         """Return the number of the data type; None where there is none."""
         text = _plain(self.keys.get("datatype", "")).lower()
         return _NAMES.index(text) + 1 if text in _NAMES else _number(text)
+
+    @property
+    def access(self) -> str:
+        """Return ro, wo, rw, rwr, rww or const; '' where the file does not state it."""
+        return _plain(self.keys.get("accesstype", "")).lower()
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Return LowLimit and HighLimit; without bounds where they are not stated or leave no range."""
+        low, high = (self._limit(key) for key in ("lowlimit", "highlimit"))
+        bounds = -math.inf if low is None else low, math.inf if high is None else high
+        return bounds if bounds[0] < bounds[1] else (-math.inf, math.inf)
+
+    def _limit(self, key: str) -> int | None:
+        """Return a limit; a hexadecimal one of a signed type is a two's complement."""
+        text = _plain(self.keys.get(key, ""))
+        value, bits = _number(text.removeprefix("-")), {2: 8, 3: 16, 4: 32}.get(self.data_type or 0)
+        if value is None or text.startswith("-"):
+            return None if value is None else -value
+        return value - (1 << bits) if bits and 1 << (bits - 1) <= value < 1 << bits else value
 
 
 @dataclass(frozen=True)

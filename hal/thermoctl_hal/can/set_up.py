@@ -20,7 +20,7 @@ from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.cia402 import CONTROL_WORD, STANDARD_TYPES
 from thermoctl_hal.base.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
 from thermoctl_hal.base.wire import CanPort
-from thermoctl_hal.can.eds import read_eds
+from thermoctl_hal.can.eds import Entry, read_eds
 
 SYNC_ID, NMT_ID = 0x080, 0x000
 NMT_START, NMT_PRE_OPERATIONAL, NMT_RESET_COMMUNICATION = 0x01, 0x80, 0x82
@@ -87,10 +87,28 @@ class Objects:
                 key,
                 f"(line {entry.line}) has no DataType: add it to the file, as DataType=0x0004 for int32",
             )
+        self._check_access(item, key, entry)
         letter = _FORMATS.get(entry.data_type)
         if letter is None:
             raise self._error(item, key, f"({entry.name}) is no whole number of up to 4 bytes")
         return letter
+
+    def _check_access(self, item: Object, key: str, entry: Entry) -> None:
+        """Raise InputError for an object that is read but cannot be, or written but cannot be."""
+        sent = key == "transmit"
+        if entry.access in (("wo",) if sent else ("ro", "const")):
+            what = f"({entry.name}, line {entry.line}) has AccessType={entry.access}: it cannot be "
+            raise self._error(item, key, what + ("sent" if sent else "written"))
+
+    def within(self, item: Object, key: str, low: float, high: float) -> None:
+        """Raise InputError where values from low to high are outside the limits of the object's EDS file."""
+        if self.eds is None or item not in self._file.entries:
+            return
+        least, most = self._file.entries[item].limits
+        if low < least or high > most:
+            given = f"{low:g}" if low == high else f"{low:g} .. {high:g}"
+            what = f"takes {least:.12g} .. {most:.12g} (LowLimit, HighLimit), {given} is outside"
+            raise self._error(item, key, what)
 
     def _error(self, item: Object, key: str, what: str) -> InputError:
         return InputError(f"{self.place}: {key}: {self.eds}: object {object_name(item)} {what}")
@@ -272,6 +290,7 @@ def check_objects(objects: Objects, spec: Cia402) -> dict[Object, str]:
                 f"{objects.place}: start_up: {value} does not fit object {object_name(item)} ({size} bits, "
                 f"{'with' if letter.islower() else 'without'} sign)"
             ) from None
+        objects.within(item, "start_up", value, value)
     size = sum(struct.calcsize(formats[item]) for item in spec.transmit)
     if size > PDO_BYTES:
         raise InputError(f"{objects.place}: transmit: a PDO has {PDO_BYTES} bytes, these objects take {size}")

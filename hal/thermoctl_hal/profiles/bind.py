@@ -13,9 +13,10 @@ from pathlib import Path
 from thermoctl.files.yamlfile import InputError, Node, Section, suggest
 from thermoctl.rig.channels import DEFAULT, AxesChannels, Channels
 from thermoctl_hal.base.binding import Binding, Bound, limits_of, port_key
-from thermoctl_hal.base.profile import BinaryFrame, Cia402, Dbc, Modbus, Profile, Register, TextLine
+from thermoctl_hal.base.profile import BinaryFrame, BusSpec, Cia402, Dbc, Modbus, Profile, Register, TextLine
 from thermoctl_hal.base.units import role_units
 from thermoctl_hal.can.eds import read_eds
+from thermoctl_hal.can.set_up import Objects
 from thermoctl_hal.ethercat.read import LONGEST_WATCHDOG_S, Ethercat
 from thermoctl_hal.modbus.read import register_hint
 from thermoctl_hal.profiles.buses import BUSES
@@ -58,16 +59,17 @@ def bind(node: Node, folder: Path, channels: Channels = DEFAULT) -> Binding:
     if isinstance(spec, Cia402):
         address = s.integer("address", spec.address, 1, 126)
         profile = replace(profile, bus_spec=_drive_of_this_rig(s, spec, address))
+        if profile.amplifier is not None:
+            counts = profile.amplifier.counts
+            Objects(spec, profile.file, address).within(
+                spec.command, "drive: 'limits' / 'scale'", min(counts), max(counts)
+            )
     elif isinstance(spec, Ethercat):
         address = s.integer("address", spec.address, 1, 199)
         if (watchdog := s.number("watchdog_s", 0.0, 1e-3, LONGEST_WATCHDOG_S)) > 0.0:
             profile = replace(profile, bus_spec=replace(spec, watchdog_s=watchdog))
     else:
-        port_text = s.text("port")
-        far = isinstance(spec, Dbc) or (isinstance(spec, Modbus) and port_text.startswith("tcp:"))
-        address = s.integer("address", spec.address, 0, LAST_ON_TCP if far else LAST_ON_A_LINE)
-        if address > LAST_ON_A_LINE and not far:
-            raise s.node.error(f"address: {address} is outside 0 .. {LAST_ON_A_LINE} of a serial line")
+        address = _address(s, spec)
         for key in ("watchdog_s", "master_id"):
             if (found := s.get(key, False)) is not None:
                 raise found.error(f"{key}: a {profile.bus} device has none")
@@ -144,6 +146,20 @@ def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound
         low * factor + shift,
         high * factor + shift,
     )
+
+
+def _address(s: Section, spec: BusSpec) -> int:
+    """Return the unit of a Modbus device, the node of a CAN device. Raises InputError."""
+    modbus = isinstance(spec, Modbus)
+    far = isinstance(spec, Dbc) or (modbus and s.text("port").startswith("tcp:"))
+    address = s.integer("address", spec.address, 0, LAST_ON_TCP if far else LAST_ON_A_LINE)
+    if modbus and address == 0 and not far:
+        raise s.node.error(
+            f"address: 0 is the broadcast, which no unit answers; give the unit's own, 1 .. {LAST_ON_A_LINE}"
+        )
+    if address > LAST_ON_A_LINE and not far:
+        raise s.node.error(f"address: {address} is outside 0 .. {LAST_ON_A_LINE} of a serial line")
+    return address
 
 
 def check_rig(bindings: Iterable[Binding]) -> list[Binding]:
