@@ -202,6 +202,14 @@ def test_a_value_is_rounded_to_its_interval(size, sign, sd):
     assert len(re.sub(r"\D", "", inner.split(" ± ")[1]).lstrip("0")) <= 6, text
 
 
+@given(sizes, sizes)
+@LOADED
+def test_the_interval_of_a_time_ends_at_zero(value, sd):
+    shown = with_interval(value, sd, "s")
+    assert (" (0 .. " in shown) == (1.96 * sd > value) and ("±" in shown) != ("(0 .." in shown)
+    assert with_interval(value, sd, "W") == with_interval(value, sd)
+
+
 def test_values_without_an_interval_have_none():
     assert with_interval(0.00393, None) == with_interval(0.00393, 0.0) == "0.00393"
     assert with_interval(0.00392967, 1.8e-7) == "0.00392967 ± 0.00000035"

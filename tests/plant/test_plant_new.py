@@ -444,3 +444,17 @@ def test_names_say_what_heats_what(folder):
         "extruder_temp",
     )
     assert plant.parameters["fan"].value == 0, "no fan was recorded"
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_second_input_of_a_motion_is_not_dropped_in_silence(folder, named, capsys):
+    t = np.arange(0.0, 20.0, 0.05)
+    push, pull = np.where(t % 8 < 4, 2.0, 0.0), np.where(t % 5 < 2, 1.0, 0.0)
+    speed = np.cumsum(push - pull - 0.5) * 0.05
+    rows = "\n".join(f"{a:g},{b:g},{c:g},{d:.5f}" for a, b, c, d in zip(t, push, pull, speed, strict=True))
+    (folder / "a.csv").write_text(f"t,F1 [N],F2 [N],speed [m/s]\n{rows}\n")
+    options = ["--inputs", "F1,F2", "--outputs", "speed"] if named else []
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", *options]) == (2 if named else 0)
+    said = capsys.readouterr().err
+    assert "'F2'" in said and "name one with --inputs" in said
+    assert (folder / "p.yaml").exists() != named

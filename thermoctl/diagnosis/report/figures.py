@@ -128,11 +128,15 @@ def size(value: float | None, unit: str) -> str:
     return "an unknown amount" if number(value) == NONE else f"{number(value)} {unit}".strip()
 
 
-def with_interval(value: float, sd: float | None) -> str:
-    """Return a value ± half of its 95 % interval, both rounded to two digits of that half."""
+def with_interval(value: float, sd: float | None, unit: str | None = None) -> str:
+    """Return a value ± half of its 95 % interval, both rounded to two digits of that half.
+
+    An interval of a time, in s, ends at 0: `3 (0 .. 9.2)`."""
     if not sd or not math.isfinite(sd):
         return f"{value:.4g}"
     half = WIDE * sd
+    if unit == "s" and 0 <= value < half:
+        return f"{value:.2g} (0 .. {value + half:.2g})"
     largest = max(abs(value), half)
     power = 0 if PLAIN[0] <= largest < PLAIN[1] else math.floor(math.log10(largest))
     places = 1 - math.floor(math.log10(half)) + power
@@ -210,7 +214,11 @@ def remainder_rows(result: Result) -> Rows:
 def parameter_rows(finding: Result) -> Rows:
     """Return the parameters of a finding or a law."""
     rows = [
-        (short(n, finding) if "effect" in finding else n, with_interval(p["value"], p["sd"]), p["unit"] or "")
+        (
+            short(n, finding) if "effect" in finding else n,
+            with_interval(p["value"], p["sd"], p["unit"]),
+            p["unit"] or "",
+        )
         for n, p in finding["parameters"].items()
     ]
     return ("parameter", "value, 95 %", "unit"), rows

@@ -191,7 +191,7 @@ def _parameters(diagnosis: Diagnosis) -> str:
             least = max(MOVED * np.hypot(e.sd, refit.sd), MOVED_SHARE * abs(e.value))
             remarks += ["stood in for what was missing"] if moved > least else []
             remarks += ["refitted, at the end of its range"] if refit.state == "at bound" else []
-        values = figures.with_interval(e.value, e.sd), unit(e.unit), "; ".join(remarks) or "ok"
+        values = figures.with_interval(e.value, e.sd, e.unit), unit(e.unit), "; ".join(remarks) or "ok"
         rows.append(
             (n, first and first.value, *([refit and refit.value] if diagnosis.extends else []), *values)
         )

@@ -4,6 +4,7 @@ The words of a sentence depend on the numbers in it as they are shown, rounded (
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -45,7 +46,15 @@ def sentences(result: Result) -> list[str]:
     texts = [_found(result, rows), *_families(result), law]
     if rows and (result["findings"] or law):
         texts.append(_gain(result, max(rows, key=lambda o: o.gain)))
-    return [text for text in (*texts, _remainder(result, rows)) if text]
+    return [_places(text, result) for text in (*texts, _remainder(result, rows)) if text]
+
+
+def _places(text: str, result: Result) -> str:
+    """Return a text with words for a node that an effect added, such as strain_backlash_hysteresis_speed."""
+    found = {str(e["effect"]) for e in (*result["findings"], *result["alternatives"])}
+    for effect in sorted(found, key=len, reverse=True):
+        text = re.sub(rf"\b(\w+?)_{effect}_(\w+)", rf"the \1 of the {effect.replace('_', ' ')} at \2", text)
+    return text
 
 
 def what_next(result: Result) -> str:
@@ -93,7 +102,7 @@ def law_sentence(entry: Result | None) -> str:
     if not entry:
         return ""
     values = ", ".join(
-        f"{n} = {with_interval(p['value'], p['sd'])} {p['unit'] or ''}".removesuffix(" 1").strip()
+        f"{n} = {with_interval(p['value'], p['sd'], p['unit'])} {p['unit'] or ''}".removesuffix(" 1").strip()
         for n, p in entry["parameters"].items()
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())

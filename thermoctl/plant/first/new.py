@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -90,7 +91,7 @@ def draft(
         lines = thermal.draft(table, [c for c in drives if c.kind != "temperature"], air, sensors)
     elif kinds & {"position", "angle", "velocity", "turning"}:
         sensors = [c for c in sensors if c.kind in ("position", "angle", "velocity", "turning")]
-        drives = _inputs(table, columns, inputs, DRIVING, sensors, "moves")[:1]
+        drives = _one_drive(table, _inputs(table, columns, inputs, DRIVING, sensors, "moves"), inputs)
         lines = motion.draft(table, drives, sensors)
     else:
         sensors = [c for c in sensors if c.kind == "level"]
@@ -104,6 +105,17 @@ def draft(
         if quoted(c.name) in text or c.name in text
     }
     return f"{head}{text}\n{_unread(table, [c for c in table.columns if c not in used])}"
+
+
+def _one_drive(table: Table, drives: list[Column], inputs: Mapping[str, str] | None) -> list[Column]:
+    """Return the one input of a motion plant, with a note on others. Raises InputError for two named ones."""
+    if len(drives) > 1:
+        others = ", ".join(f"'{c.name}'" for c in drives[1:])
+        advice = "a first motion plant has one input: name one with --inputs, and add the force of the other by hand"
+        if inputs is not None:
+            raise InputError(f"{table.path}: --inputs: {others} beside '{drives[0].name}'; {advice}")
+        print(f"note: {table.path}: '{drives[0].name}' is the input, not {others}; {advice}", file=sys.stderr)
+    return drives[:1]
 
 
 def _unread(table: Table, names: Sequence[str]) -> str:
