@@ -253,3 +253,28 @@ def test_a_network_is_as_wide_as_its_page_and_no_box_covers_another(file, widest
     assert len(boxes) > 20 and not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
     page = figure.bbox
     assert all(page.containsx(x) and page.containsy(y) for b in boxes for x, y in b.corners())
+
+
+def test_a_refit_says_from_which_start_its_error_is_seen(tmp_path, capsys):
+    """Logged from the middle of a swing: without the fitted start, no simulation shows the error that the refit states."""
+    (tmp_path / "p.yaml").write_text(
+        "format: thermoctl-plant/1\ntitle: A swing\nparameters: {k: {value: 4, range: [1, 9], unit: 1/s^2}}\n"
+        "nodes:\n  v: {storage: 1, initial: 0, initial_sigma: 5, unit: m/s}\n"
+        "  x: {storage: 1, initial: first(seen), initial_sigma: 0.01, unit: m}\n"
+        "flows: {spring: {from: v, rate: k * x, unit: m/s^2}, travel: {into: x, rate: v, unit: m/s}}\n"
+        "outputs: {seen: {value: x, column: x, unit: m, noise: 0.01}}\n"
+    )
+    t = np.arange(400) * 0.02
+    seen = np.sin(2.2 * t + 0.3) + 0.01 * np.random.default_rng(4).normal(size=400)
+    write_table(tmp_path / "a.csv", Table("a", "a", t, {"x": seen}))
+    assert main(f"refit --plant {tmp_path}/p.yaml {tmp_path}/a.csv --out {tmp_path}/q.yaml".split()) == 0
+    said = capsys.readouterr().out.splitlines()
+    stated = float(next(line for line in said if "│ a " in line).replace("│", " ").split()[-1])
+    start = said[-1].split()[-1]
+    assert stated < 0.011
+    for given, error in (("", 0.5), (f"--initial {start}", stated)):
+        command = f"simulate --plant {tmp_path}/q.yaml {tmp_path}/a.csv --out {tmp_path}/s.csv {given}"
+        assert main(command.split()) == 0
+        c = read_table(tmp_path / "s.csv").columns
+        rms = np.sqrt(np.mean((c["x"] - c["x_simulated"]) ** 2))
+        assert rms > error if not given else rms == pytest.approx(error, rel=0.01)

@@ -11,7 +11,7 @@ import numpy as np
 from thermoctl.api.plants import Plant
 from thermoctl.api.plots import profile_curve, residual_panels
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.plant.fitting.estimate import Estimate, report, updated
+from thermoctl.plant.fitting.estimate import Estimate, report, starts, updated
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.simulation.simulate import Excitation, compile_plant
 from thermoctl.report.page import figure, table
@@ -40,6 +40,11 @@ class Refit:
         One of a recording of its own is called `NAME (RECORDING)`."""
         estimates = report(self.fit, self.excitations)
         return {f"{e.name} ({e.recording})" if e.recording else e.name: e for e in estimates}
+
+    @property
+    def starts(self) -> dict[str, dict[str, float]]:
+        """Fitted initial values by recording and node, as `simulate` takes them: `x0=starts[RECORDING]`."""
+        return starts(self.fit, self.excitations)
 
     @property
     def rms(self) -> dict[str, float]:

@@ -16,7 +16,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
-from thermoctl.plant.fitting.estimate import Estimate, report, updated
+from thermoctl.plant.fitting.estimate import Estimate, report, starts, updated
 from thermoctl.plant.fitting.noise import coloured
 from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.recordings import read_recordings
@@ -247,6 +247,7 @@ def refit(args: argparse.Namespace, read: Reader | None = None) -> int:
                 for o in plant.outputs:
                     grid.add_row(table.name, part, o, f"{before[o]:.4g}", f"{after[o]:.4g}")
         Console().print(grid)
+        print(_starts(found, excitations), end="")
     except SimulationError as e:
         raise InputError(f"{plant.file}: {e}") from None
     return 0
@@ -257,6 +258,15 @@ def _ended(found: Fit) -> str:
     if found.converged:
         return ""
     return f"the refit ended by its limit of steps or time: its cost, {found.cost:.4g}, may fall by {found.left:.2g} more\n"
+
+
+def _starts(found: Fit, excitations: list[Excitation]) -> str:
+    """Return the starts that were fitted, a line for each recording; nothing if none was uncertain."""
+    lines = [
+        f"  {name}  {','.join(f'{n}={v:.6g}' for n, v in values.items())}\n"
+        for name, values in starts(found, excitations).items()
+    ]
+    return "".join(["fitted starts, as thermoctl simulate --initial takes them:\n", *lines]) if lines else ""
 
 
 def _estimates(plant: Plant, rows: list[Estimate]) -> Grid:

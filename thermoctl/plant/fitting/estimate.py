@@ -85,3 +85,12 @@ def updated(plant: Plant, found: Fit, excitations: Sequence[Excitation]) -> Plan
         )
         parameters[q] = dataclasses.replace(p, value=float(np.clip(np.mean(column), *p.range)), values=values)
     return dataclasses.replace(plant, parameters=parameters)
+
+
+def starts(found: Fit, excitations: Sequence[Excitation]) -> dict[str, dict[str, float]]:
+    """Return the fitted initial values by recording and node; empty where no initial value is uncertain."""
+    model, out = found.model, dict[str, dict[str, float]]()
+    for d, values, dx0 in zip(excitations, found.values, found.dx0, strict=True):
+        states = dict(zip(model.states, model.start(d, values, dx0)[0], strict=True))
+        out[d.name] = {n: float(states[n]) for n in model.uncertain}
+    return out if model.uncertain else {}
