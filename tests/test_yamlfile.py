@@ -81,9 +81,13 @@ def test_a_number_is_finite(number):
         ("a: {value: 3,5e3}", "write 3.5e3"),
         ("a: {value: 3,5 ms}", "write 3.5 ms"),
         ('{"a": {"value": 3,5}}', "write 3.5"),
+        (
+            "a: {rate: K * min(x - y, 2), unit: W}",
+            ':1:11: a comma ends this value; quote the whole: "K * min(x - y, ..."',
+        ),
     ],
 )
-def test_a_decimal_comma_in_braces_is_no_key(text, says):
+def test_a_comma_in_braces_begins_no_key(text, says):
     with pytest.raises(InputError, match=re.escape(says)):
         loads(text)
 

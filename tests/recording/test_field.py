@@ -112,6 +112,18 @@ def test_matlab_states_its_interval(tmp_path, name, value, step):
         np.testing.assert_allclose(read_recording(tmp_path / "run.mat").t, step * np.arange(4))
 
 
+def test_matlab_matrix_stands_beside_vectors_of_its_length(tmp_path):
+    """The outputs of a whole experiment were left out without a word."""
+    savemat = pytest.importorskip("scipy.io").savemat
+    u, x = np.array([1.0, 0, 1, 1]), np.array([[20.0, 22, 21, 20], [5, 6, 7, 8]])
+    for matrix in (x, x.T):
+        savemat(tmp_path / "run.mat", {"ts": 2.0, "u": u[:, None], "x": matrix, "gains": np.ones((1, 3))})
+        found = read_recording(tmp_path / "run.mat")
+        np.testing.assert_allclose(found.t, 2 * np.arange(4))
+        assert sorted(found.columns) == ["u", "x_1", "x_2"]
+        np.testing.assert_allclose([found.columns["x_1"], found.columns["x_2"]], x)
+
+
 def test_an_assumed_unit_is_said(tmp_path):
     assert any("assumed: s" in n for n in read(tmp_path, table("time,T", "0,20", "1,21")).notes)
     assert any("a counter" in n for n in read(tmp_path, CLOCKS["a counter, for want of times"][0]).notes)

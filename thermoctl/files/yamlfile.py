@@ -150,7 +150,7 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
         raise InputError(f"{place}: nested deeper than {MAX_DEPTH} levels")
     if isinstance(node, yaml.MappingNode):
         out: dict[str, Node] = {}
-        _refuse_decimal_comma(node, file)
+        _refuse_commas(node, file)
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise InputError(f"{place}: a key must be a plain word")
@@ -180,12 +180,19 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
     raise InputError(f"{place}: the tag {node.tag} is not allowed here")
 
 
-def _refuse_decimal_comma(node: yaml.MappingNode, file: str) -> None:
-    """Raise InputError for `{value: 3,5}`, in which YAML takes 5 for a key without a value."""
+def _refuse_commas(node: yaml.MappingNode, file: str) -> None:
+    """Raise InputError where a comma ends a value in braces: `{value: 3,5}`, `{rate: min(a, b)}`.
+
+    YAML takes what follows the comma for a key without a value."""
     for (_, before), (key, value) in pairwise(node.value):
-        begin, end = key.start_mark, before.end_mark
-        adjacent = begin.line == end.line and begin.column == end.column + 1
-        if adjacent and not value.value and (said := decimal_comma(f"{before.value},{key.value}")):
+        if value.value or not isinstance(before, yaml.ScalarNode):
+            continue
+        begin, end, said = key.start_mark, before.end_mark, ""
+        if not before.style and before.value.count("(") > before.value.count(")"):
+            said = f'a comma ends this value; quote the whole: "{before.value}, ..."'
+        elif begin.line == end.line and begin.column == end.column + 1:
+            said = decimal_comma(f"{before.value},{key.value}")
+        if said:
             raise InputError(f"{file}:{before.start_mark.line + 1}:{before.start_mark.column + 1}: {said}")
 
 

@@ -251,35 +251,30 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
             sheets.append(Sheet(columns, _row_of(path), name=name, step_s=_stated(_fields(value))))
         elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
             loose[name] = np.squeeze(value).astype(float)
-    sheets += _of_vectors(path, loose) or ([] if sheets else _of_matrices(path, loose))
+    sheets += _of_arrays(path, loose)
     for sheet in sheets:
         sheet.step_s = sheet.step_s or step_s
     if len(sheets) > 1:
         sheets.sort(key=len, reverse=True)
-        read = sheets[0].name or ", ".join(sheets[0].columns)
-        notes.append(f"'{read}' read, of {', '.join(content)} (another: --sheet VARIABLE)")
+        notes.append(f"'{sheets[0].name}' read, of {', '.join(content)} (another: --sheet VARIABLE)")
     return sheets[:1]
 
 
-def _of_vectors(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
-    """Return vectors of one length as tables."""
+def _of_arrays(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
+    """Return vectors and matrices of one length as tables; a matrix has its longer side as rows."""
     sheets = []
-    for size in {len(v) for v in loose.values() if v.ndim == 1}:
-        columns: dict[str, Cells] = {n: v for n, v in loose.items() if v.ndim == 1 and len(v) == size}
+    for size in {max(v.shape) for v in loose.values()}:
+        own = {n: v for n, v in loose.items() if max(v.shape) == size and v.ndim <= 2}  # noqa: PLR2004
+        columns: dict[str, Cells] = {}
+        for name, v in own.items():
+            if v.ndim == 1:
+                columns[name] = v
+                continue
+            tall = v.T if v.shape[0] < size else v
+            of = name if len(own) > 1 else "column"
+            columns |= {f"{of}_{i + 1}": c for i, c in enumerate(tall.T)}
         if len(columns) > 1:
-            sheets.append(Sheet(columns, _row_of(path)))
-    return sheets
-
-
-def _of_matrices(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
-    """Return matrices as tables, the longer side as rows."""
-    sheets = []
-    for name, matrix in loose.items():
-        if matrix.ndim == 2:  # noqa: PLR2004
-            tall = matrix.T if matrix.shape[0] < matrix.shape[1] else matrix
-            sheets.append(
-                Sheet({f"column_{i + 1}": c for i, c in enumerate(tall.T)}, _row_of(path), name=name)
-            )
+            sheets.append(Sheet(columns, _row_of(path), name=", ".join(own)))
     return sheets
 
 
