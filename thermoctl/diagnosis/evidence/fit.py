@@ -28,6 +28,7 @@ from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
 from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
 from thermoctl.diagnosis.evidence.starts import beside_parent, first_point
+from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.climb import Climbed
@@ -65,6 +66,7 @@ class Fitted:
     rough_powers: tuple[np.ndarray, ...]
     curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
     past: Past  # posterior of earlier recordings
+    before: tuple[frozenset[Key], float] | None  # effects and log likelihood of the hypothesis it extends
 
     @property
     def absent(self) -> bool:
@@ -129,7 +131,13 @@ def _none_stands(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool
     """Return whether all amplitudes together are as near to no effect as one within SIGNIFICANT sd of it.
 
     Storage and conductance of a hidden mass replace each other: each is uncertain, both are certain together.
-    So the square of their distance from no effect has the metric of their correlations."""
+    So the square of their distance from no effect has the metric of their correlations. Where a parameter of
+    the plant replaces a large effect, all are uncertain. Then the likelihood without the effect tells, by
+    twice the log of their ratio (Wilks 1938), which does not depend on how the effect is parametrised."""
+    enough = chdtri(len(sizes), chdtrc(1, SIGNIFICANT**2))
+    known, likelihood = f.before or (None, 0.0)
+    if known == f.hypothesis.keys - {e.key} and 2 * (f.log_likelihood - likelihood) >= enough:
+        return False
     columns = [q for q, r in f.fit.unknowns if r is None]
     own = [e.own[p.name] for p in sizes]
     if not set(own) <= set(columns):  # an amplitude for each recording
@@ -142,7 +150,7 @@ def _none_stands(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool
     size = np.sqrt(np.maximum(np.diag(spread), TINY))
     away = np.array([_distance(f, e, p) for p in sizes])
     square = away @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ away
-    return bool(square < chdtri(len(sizes), chdtrc(1, SIGNIFICANT**2)))
+    return bool(square < enough)
 
 
 def _distance(f: Fitted, e: Placed, p: EffectParameter) -> float:
@@ -215,10 +223,12 @@ def _refitted(
         except SimulationError:
             other = top
         top = max(top, other, key=lambda t: t.spot.height)
-    return _weighed(case, posterior, top, start)
+    return _weighed(case, posterior, top, start, parent)
 
 
-def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -> Fitted:
+def _weighed(
+    case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit, parent: Fitted | None
+) -> Fitted:
     """Return the fitted hypothesis at the maximum `top`, with its log evidence by Laplace's method."""
     problem, matrix = posterior.problem, top.matrix
     flat, spot = without_slopes(posterior, top.spot, matrix)
@@ -269,6 +279,7 @@ def _weighed(case: Case, posterior: Posterior, top: Climbed[Seen], rough: Fit) -
         tuple(rough_powers),
         kept(confined, np.array([r is None for _, r in problem.unknowns], bool)),
         posterior.past,
+        (parent.hypothesis.keys, parent.log_likelihood) if parent else None,
     )
 
 
