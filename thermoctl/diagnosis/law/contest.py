@@ -33,6 +33,7 @@ from thermoctl.diagnosis.search.beam import (
     searched,
     swap,
 )
+from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -42,12 +43,18 @@ def with_laws(
 ) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
-    No law is sought if the plant leaves only noise and no effect was found. Nor is one if the best hypothesis
-    leaves only noise and no law is worth its odds there (`pays`). The size of a residual alone does not see
-    tens of nats, by which a law may fit better than the effect that imitates it."""
+    No law is sought if the plant leaves only noise and no effect was found. Nor is one if a single effect
+    leaves only noise and no law is worth its odds beside it (`pays`). The size of a residual alone does not see
+    tens of nats, by which a law may fit better than the effect that imitates it. Two effects may imitate one
+    law with more parameters than it has, so nothing is left beside them that would pay."""
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
     alone, best = tried[frozenset()], result.tried[0]
-    if only_noise(case, best.fitted, limits) and (best is alone or not _pays(case, best, limits)):
+    effects = len(best.fitted.hypothesis.effects)
+    if (
+        only_noise(case, best.fitted, limits)
+        and effects < PAIR
+        and (not effects or not _pays(case, best, limits))
+    ):
         return result
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
