@@ -40,7 +40,7 @@ def cooled(loss: str, noise: float, samples: int) -> tuple:
 
 
 def test_an_effect_that_a_parameter_of_the_plant_may_replace_is_kept():
-    """Its size is 1.9 standard errors from none, because G replaces it. Without it the likelihood is 15 nats lower."""
+    """Its size is 1.9 standard errors from none, because G replaces it; it is 10 nats more probable than none."""
     plant, table = cooled("G * 0.17 * (1 + 0.09 * (water - 20)) * (water - room)", 2.0, 300)
     names = ("temperature_dependent_conductance", "variable_heat_capacity", "hidden_thermal_mass")
     entries = {n: e for n, e in catalogue().items() if n in names}

@@ -194,7 +194,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "pays": Rule(
-        "beside a best that leaves only noise, laws compete only where a free function pays for one",
+        "beside one effect that leaves only noise, laws compete only where a free function pays for one",
         {"law.contest.pays": lambda case, f, limits: True},
         searches=True,
     ),

@@ -44,9 +44,9 @@ def with_laws(
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     No law is sought if the plant leaves only noise and no effect was found. Nor is one if a single effect
-    leaves only noise and no law is worth its odds beside it (`pays`). The size of a residual alone does not see
-    tens of nats, by which a law may fit better than the effect that imitates it. Two effects may imitate one
-    law with more parameters than it has, so nothing is left beside them that would pay."""
+    leaves only noise and no law is worth its odds beside it (`pays`). The size of a residual alone does not
+    see tens of nats, by which a law may fit better than the effect that imitates it. Two effects may imitate
+    one law with more parameters than it has. Nothing is left beside them then, so a law is always tried."""
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
     alone, best = tried[frozenset()], result.tried[0]
     effects = len(best.fitted.hypothesis.effects)
