@@ -191,3 +191,15 @@ def test_a_socket_path_that_the_system_does_not_allow(config, capsys, size, fits
     for command in () if fits else ("run", "status"):
         assert main([command, "--config", str(config)]) != 0
         assert "give a shorter socket.path" in capsys.readouterr().err
+
+
+def test_a_socket_path_that_is_too_long_for_an_axis(tmp_path, capsys):
+    """The axes' sockets have the axis in their names: stage.sock fits, stage-x.sock does not."""
+    shutil.copytree(CONFIG, tmp_path / "config")
+    config = tmp_path / "config/examples/stage.yaml"
+    path = f"{tmp_path}/" + "s" * (106 - len(str(tmp_path)) - 6) + ".sock"
+    change(config, ("path: ../../run/stage.sock", f"path: {path}"))
+    assert main(["check", "--config", str(config)]) == 1
+    assert "108 bytes; a socket's path of at most 107 was expected" in capsys.readouterr().out
+    assert main(["run", "--config", str(config)]) != 0
+    assert "give a shorter socket.path" in capsys.readouterr().err

@@ -23,13 +23,19 @@ def lock_path(settings: Settings) -> Path:
     return Path(settings.rig_socket or settings.socket.path).with_suffix(".lock")
 
 
+def socket_too_long(settings: Settings) -> str:
+    """Return a sentence where the path of the rig's socket, or of an axis', is too long; '' else."""
+    paths = (part.socket.path for part in (settings, *settings.axes))
+    return next(filter(None, (long_socket(path, "socket.path") for path in paths)), "")
+
+
 def hold(settings: Settings) -> int:
     """Take the rig's lock; return the open file that keeps it.
 
     Raises InputError when another process holds the rig.
     """
     path = lock_path(settings)
-    if long := long_socket(settings.socket.path, "socket.path"):
+    if long := socket_too_long(settings):
         raise InputError(long)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
-from thermoctl.daemon.lock import holder
+from thermoctl.daemon.lock import holder, socket_too_long
 from thermoctl.daemon.offline.ready import obstacles
 from thermoctl.daemon.tick.arrival import expected_hz, slow
 from thermoctl.daemon.tick.assemble import (
@@ -32,7 +32,6 @@ from thermoctl.daemon.tick.assemble import (
 )
 from thermoctl.daemon.tick.loop import become_real_time
 from thermoctl.extras import lacking
-from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.writer import disk_warning
 from thermoctl.rig.channels import AMPLIFIER_STATES
@@ -75,7 +74,7 @@ def _check(settings: Settings) -> int:
         reported = list(obstacles(settings))
         warnings = power_warning(settings), priority_warning(settings), *device_warnings(settings)
         reported += [(False, w) for w in warnings if w]
-    if long := long_socket(settings.socket.path, "socket.path"):
+    if long := socket_too_long(settings):
         reported.append((True, long))
     for in_the_way, line in reported:
         print(f"{'error' if in_the_way else 'warning'}: {line}")
