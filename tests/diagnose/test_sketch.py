@@ -13,7 +13,7 @@ from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.search import again
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import directions, groups_of, screen
 from thermoctl.diagnosis.search.sketch import SKETCHES, likeliest, products
@@ -29,7 +29,7 @@ def chain(tmp_path_factory):
     plant = load(folder / "plant.yaml")
     known = case(plant, read_recordings(plant, [folder / "run_1.csv"]), catalogue(), Budget(80))
     first = fitted(known, known.plant, (), known.null)
-    metric = Metric(Plain(known, first, ROWS), first.average, False)
+    metric = Metric(Plain(known, first.rough), first.average, False)
     rig = known.rig(first.rough_plant, metric.drives)
     found = candidates(rig, known.catalogue)
     return metric, rig, found, [Trajectory(metric, rig, 0)]

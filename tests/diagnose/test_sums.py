@@ -12,7 +12,7 @@ from thermoctl.diagnosis.evidence.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.law.smooth import _smoothed
 from thermoctl.diagnosis.run import diagnose
-from thermoctl.diagnosis.search.metric import FREE, ROWS, Absorbed, Metric, Plain
+from thermoctl.diagnosis.search.metric import FREE, Absorbed, Metric, Plain
 from thermoctl.diagnosis.search.overlay import filtered
 from thermoctl.plant.fitting import residuals
 
@@ -26,7 +26,7 @@ def known(tmp_path_factory):
 def test_the_metric_is_that_of_noise_free_parameters_and_starts_within_their_priors(known):
     """Against the covariance of all rows: the noise's and the one that all unknowns add, side by side."""
     null = fitted(known, known.plant, (), known.null)
-    plain = Plain(known, null, ROWS)
+    plain = Plain(known, null.rough)
     metric = Metric(plain, as_refitted(known, null).average, True)
     whole, at = np.zeros((len(metric.weight), len(plain.problem.unknowns))), 0
     for r, rows in enumerate(plain.sensitivities):

@@ -35,7 +35,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
@@ -191,7 +191,7 @@ def test_the_response_to_a_law_is_that_of_the_plant_with_it_however_fast_it_move
     table = compile_plant(plant).measure(Table("run", "", t, {"force": force}), 1)
     known = case(plant, [table], {}, Budget(80))
     null = fitted(known, plant, (), known.null)
-    metric = Metric(Plain(known, null, ROWS), null.average, False)
+    metric = Metric(Plain(known, null.rough), null.average, False)
     own, size = metric.signals[0], 1e-3
     q = np.abs(own["force"]) * np.tanh(own["velocity"] / 1e-3)
     more = Flow("more", ex.parse(f"{size} * abs(force) * tanh(velocity / 0.001)"), "velocity", None)

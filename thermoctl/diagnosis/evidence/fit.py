@@ -287,9 +287,7 @@ def remembered(case: Case, f: Fitted) -> Past:
     """Return the posterior of a hypothesis from all recordings so far."""
     shared = np.array([r is None for _, r in f.fit.unknowns], bool)
     names = tuple(q for q, r in f.fit.unknowns if r is None)
-    outputs = [
-        (case.null.model.outputs[case.coordinates.channels[g.channels[0]].output], g) for g in case.grids
-    ]
+    outputs = [*zip(case.measured, case.grids, strict=True)]
     return Past(
         placed_before(f.hypothesis.effects, f.plant),
         names,
@@ -322,11 +320,6 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
     """Return the hypothesis at its other refit, in white noise: the free run is closest to the data there."""
     average = averaged(case.grids, f.rough_powers)
     return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
-
-
-def as_weighed(f: Fitted) -> Fitted:
-    """Return the hypothesis with the maximum of its posterior in place of the refit in white noise."""
-    return dataclasses.replace(f, rough_plant=f.plant, rough=f.fit, rough_powers=f.powers)
 
 
 def with_residuals(case: Case, f: Fitted) -> Fitted:

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import SPREAD
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 
 PIECES = 8  # number of knots of a free function of a signal
 NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
@@ -33,7 +33,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
     off the gain. Raises SimulationError."""
     refitted = as_refitted(case, f)
-    metric = Metric(Plain(case, f, ROWS), refitted.average, True)
+    metric = Metric(Plain(case, f.rough), refitted.average, True)
     linear = Tracked(metric, metric.residual, {})
     rig = case.rig(f.rough_plant, metric.drives)
     where = places(rig)

@@ -26,9 +26,10 @@ from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnosis.law.signals import Place, Values
-from thermoctl.diagnosis.search.metric import ROWS, Absorbed, Metric, Plain, Pushed
+from thermoctl.diagnosis.search.metric import Absorbed, Metric, Plain, Pushed
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
+from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
@@ -208,7 +209,7 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
             for t, h, w in zip(case.tables, hats, weights, strict=True)
         )
         try:
-            plain = _at(dataclasses.replace(case, tables=tables), f, plant, model, z)
+            plain = _at(dataclasses.replace(case, tables=tables), f.rough, model, z)
             metric = Metric(plain, average, False)
         except SimulationError:
             break
@@ -233,14 +234,13 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
     return best[1]
 
 
-def _at(case: Case, f: Fitted, plant: Plant, model: Model, z: np.ndarray) -> Plain:
+def _at(case: Case, fit: Fit, model: Model, z: np.ndarray) -> Plain:
     """Return the rows of a plant at its parameters' values, with the initial states of z."""
     problem = Problem(model, case.drives(model), case.noise)
     z = np.concatenate([problem.z_plant[: problem.n_parameters], z[problem.n_parameters :]])
     values, dx0 = problem.unpack(z)
     # a parameter that the refit without a law put at its bound may leave it with one
-    rough = dataclasses.replace(f.rough, model=model, values=values, dx0=dx0, z=z, at_bound={})
-    return Plain(case, dataclasses.replace(f, rough=rough, rough_plant=plant), ROWS)
+    return Plain(case, dataclasses.replace(fit, model=model, values=values, dx0=dx0, z=z, at_bound={}))
 
 
 def _started(plain: Plain, metric: Metric, left: Sequence[np.ndarray]) -> np.ndarray:

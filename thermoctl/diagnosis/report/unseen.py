@@ -22,7 +22,7 @@ from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Norms, directions, groups_of
 
@@ -82,7 +82,7 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     """Return the smallest visible size of every effect at every place, by effect and place.
 
     `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
-    metric = Metric(Plain(case, null, ROWS), average, True)
+    metric = Metric(Plain(case, null.rough), average, True)
     rig = case.rig(null.rough_plant, metric.drives)
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]

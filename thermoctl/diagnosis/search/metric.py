@@ -16,9 +16,9 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transforms
 from thermoctl.diagnosis.data.grids import grid
-from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.evidence.where import signals
+from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import Simulation
 
@@ -65,15 +65,15 @@ def without(own: Sequence[Absorbed], d: np.ndarray) -> np.ndarray:
 
 
 class Plain:
-    """DCT rows of a refitted hypothesis, not whitened: of its residual and of its sensitivities to z."""
+    """DCT rows of a fit, not whitened: of its residual and of its sensitivities to z."""
 
-    def __init__(self, case: Case, fitted: Fitted, most: int):
-        self.case, self.fit, self.model = case, fitted.rough, fitted.rough.model
+    def __init__(self, case: Case, fit: Fit):
+        self.case, self.fit, self.model = case, fit, fit.model
         self.drives = case.drives(self.model)
         self.problem = Problem(self.model, self.drives, case.noise)
         for d, values in zip(self.drives, self.fit.values, strict=True):
             self.model.prepare(d, values)
-        self.coordinates = Coordinates(self.drives, max(most // len(case.coordinates.channels), 32))
+        self.coordinates = Coordinates(self.drives, max(ROWS // len(case.coordinates.channels), 32))
         measured = self.coordinates.by_output().values()
         self.grids = [
             grid(self.coordinates, ks, g.sigma, g.swing, g.change, g.sensor, g.block)
@@ -90,10 +90,6 @@ class Plain:
     def unknowns(self, r: int) -> np.ndarray:
         """Return the unknowns of recording r."""
         return self.problem.columns[r, self.problem.columns[r] >= 0]
-
-    def rows(self, r: int, e: np.ndarray) -> np.ndarray:
-        """Transform samples (N, outputs, ...) of recording r to the DCT rows of all its channels."""
-        return transforms(self.channels[r], e)
 
 
 def _sensitive(
@@ -191,10 +187,6 @@ class Metric:
         """Return the transpose of `project`, applied to rows w (rows, ...): w' project(d) = pulled(w)' d."""
         return without(self.own, self.shared.without(w))
 
-    def unweighted(self, r: int, e: np.ndarray) -> np.ndarray:
-        """Transform samples (N, outputs, ...) of recording r to rows (rows, ...) that are not whitened."""
-        return self.plain.rows(r, e)
-
     def responses(self, pushed: Callable[[int], Pushed], count: int) -> np.ndarray:
         """Return the rows (rows, count), not whitened, of the responses in all recordings.
 
@@ -206,7 +198,7 @@ class Metric:
         )
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
-        """Apply the transpose of `unweighted` to rows w (rows, k): return (N, outputs, k) of recording r."""
+        """Apply the transpose of `transforms` to rows w (rows, k): return (N, outputs, k) of recording r."""
         d, begin = self.drives[r], 0
         out = np.zeros((*d.y.shape, w.shape[1]))
         for c in self.plain.coordinates.channels:
@@ -219,7 +211,7 @@ class Metric:
         """Transform samples (N, outputs, ...) of recording r to whitened rows (rows, ...)."""
         channels = zip(self.plain.coordinates.channels, self.weights, strict=True)
         weight = np.concatenate([w for c, w in channels if c.recording == r])
-        x = self.unweighted(r, e)
+        x = transforms(self.plain.channels[r], e)
         return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
     def rise(self, rows: np.ndarray) -> Callable[[np.ndarray], float]:

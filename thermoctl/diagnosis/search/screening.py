@@ -15,7 +15,7 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.fine import above, fine
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Keep, Norms, Select, ignored, screen
 from thermoctl.diagnosis.search.sketch import likeliest
@@ -52,7 +52,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     with that noise alone.
     `known`: the first screening, which fills it; a later one may simulate few directions (again.py)."""
     refitted = as_refitted(case, fitted)
-    plain = Plain(case, fitted, ROWS)
+    plain = Plain(case, fitted.rough)
     metric = Metric(plain, refitted.average, True)
     loud = max(over_noise(case, refitted)) > LOUD
     slow = max(refitted.average.remainder) >= PRESENT

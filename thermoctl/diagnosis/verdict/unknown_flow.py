@@ -23,12 +23,12 @@ from scipy.linalg import block_diag
 from scipy.special import expit, logsumexp
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted, as_weighed
+from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.evidence.where import typical_flow, typical_rate
 from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.metric import ROWS, Metric, Plain
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError
 
@@ -83,8 +83,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     """Return the log Bayes factor of an unknown flow into each node and along each flow between two of them.
 
     Raises SimulationError."""
-    f = as_weighed(f)
-    metric = Metric(Plain(case, f, ROWS), f.average, True)
+    metric = Metric(Plain(case, f.fit), f.average, True)
     knots = int(np.clip(TOGETHER // len(metric.runs), FEWEST, KNOTS))
     hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
     coarse = {name for name, is_coarse in zip(case.measured, rounded(case), strict=True) if is_coarse}
