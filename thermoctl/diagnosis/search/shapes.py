@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from thermoctl.diagnosis.evidence.onsets import ONSETS
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
@@ -15,9 +16,10 @@ REPEATED = 2.0  # least number of periods over the span of the signal
 BEYOND = 1 / 3, 2 / 3  # levels above the last quantile: shares of the way to the extreme
 # Periods over the span of the signal: up to the first number all are tried, up to the second the strongest.
 SLOW_TURNS, FINE_TURNS = 60.0, 4000
+STRONGEST = 16  # number of the strongest periods that are tried
 
 
-def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count: int = 16) -> np.ndarray:
+def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float) -> np.ndarray:
     """Return the numbers of periods over the span of x, above SLOW_TURNS, at which errors are strongest.
 
     They are peaks of the spectrum over x. `errors`: (N,) by recording; their part that is slow in time is
@@ -41,21 +43,21 @@ def _fine_turns(x: np.ndarray, errors: Sequence[np.ndarray], span: float, count:
     ]  # in steps of a quarter of a period
     power[: int(4 * SLOW_TURNS)] = 0.0
     peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
-    return peaks[np.argsort(-power[peaks])[:count]] / 4
+    return peaks[np.argsort(-power[peaks])[:STRONGEST]] / 4
 
 
 Grid = list[dict[str, float]]
 
 
-def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation], onsets: int = 24) -> Grid:
-    """Return the values of a shape that a screening tries.
+def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
+    """Return the values of a shape that a screening tries; not of phases and windows (`groups_of`).
 
     A value may hold `picked_from`, the number of values from which the residual itself picked it. A period
     holds `longest`, the longest period that repeats in the recordings. A level holds `least` and `most`, the
     ends of its prior."""
-    if kind in ("onsets", "windows", "times", "lags", "delays"):
-        return _times(kind, candidate.rig.duration, candidate.rig.sample, onsets)
-    if kind in ("periods", "phases", "distances"):
+    if kind in ("onsets", "times", "lags", "delays"):
+        return _times(kind, candidate.rig.duration, candidate.rig.sample)
+    if kind in ("periods", "distances"):
         return _positions(kind, candidate, runs)
     if kind in ("speeds", "creep_speeds"):
         v = np.abs(_signal(candidate, runs, _symbols(candidate)["v"]))
@@ -85,31 +87,24 @@ def _signal(candidate: Candidate, runs: Sequence[Simulation], e: Expr) -> np.nda
     return np.concatenate(parts)
 
 
-def _times(kind: str, duration: float, dt: float, onsets: int) -> Grid:
-    """Return onsets or windows in recordings of `duration` s, or time constants of lags and delays.
+def _times(kind: str, duration: float, dt: float) -> Grid:
+    """Return onsets in recordings of `duration` s, or time constants of lags and delays.
 
-    `dt`: the sampling time in s. `onsets`: number of onsets."""
+    `dt`: the sampling time in s."""
     if kind == "onsets":
-        return [{"onset": float(v)} for v in np.linspace(0, duration, onsets + 2)[1:-1]]
-    if kind == "windows":
-        edges = np.linspace(0, duration, onsets + 1)
-        return [
-            {"start": float(a), "end": float(b)} for k, a in enumerate(edges[:-1]) for b in edges[k + 1 :]
-        ]
+        return [{"onset": float(v)} for v in np.linspace(0, duration, ONSETS + 2)[1:-1]]
     least, most, count = {"times": (3, 0.6, 12), "lags": (0.5, 0.1, 10), "delays": (0.3, 0.03, 9)}[kind]
     return [{"tau": float(v)} for v in np.geomspace(least * dt, most * duration, count)]
 
 
 def _positions(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
-    """Return periods, phases or distances over the signal x, or for a distance over the position."""
+    """Return periods or distances over the signal x, or for a distance over the position."""
     rig, symbols = candidate.rig, _symbols(candidate)
     x = _signal(candidate, runs, symbols["x"]) if "x" in symbols else np.array([0.0, 1.0])
     if kind == "distances" and "x" not in symbols:
         position = rig.position_of.get(candidate.place.nodes.get("v") or "")
         x = _signal(candidate, runs, name(position)) if position else x
     span = float(np.ptp(x[np.isfinite(x)])) or 1.0
-    if kind == "phases":
-        return [{"phase": 0.0}, {"phase": float(np.pi / 2)}]
     if kind == "distances":
         return [{"distance": float(v)} for v in np.geomspace(1e-3 * span, 0.5 * span, 8)]
     longest = span / REPEATED
