@@ -22,11 +22,11 @@ def weighed(scores):
 def test_a_small_remainder_that_is_certain_is_not_nothing():
     found = weighed({NOTHING: 0.0, ONE: -9.0})
     assert (
-        decide(found, Facts(found.something, found.something, (), 1.04, 1.0, 0.99), limits()).verdict
+        decide(found, Facts(found.something, found.something, (), 1.04, 1.0, remains=0.99), limits()).verdict
         == "unexplained"
     )
     found = weighed({NOTHING: 0.0, ONE: 40.0})
-    beside = decide(found, Facts(found.something, found.something, (A,), 1.04, 0.3, 0.99), limits())
+    beside = decide(found, Facts(found.something, found.something, (A,), 1.04, 0.3, remains=0.99), limits())
     assert (beside.verdict, beside.named) == ("partly_explained", (A,))
 
 
@@ -45,7 +45,7 @@ def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
     posterior = weighed(scores)
     found = decide(
         posterior,
-        Facts(posterior.something, posterior.something, named, over_noise, 1.0, 0.0, worse),
+        Facts(posterior.something, posterior.something, named, over_noise, 1.0, worse),
         limits(),
     )
     assert found.verdict == verdict

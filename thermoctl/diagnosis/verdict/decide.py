@@ -33,18 +33,18 @@ class Facts:
     - `known`: the same; 0 if other data confirmed no effect or law
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
-    - `remains`: the largest probability of a remainder at an output
-    - `flow`: probability that a flow is missing which no output shows alone
     - `worth`: held-out error with the findings, divided by that of the refitted plant
-    - `worse`: probability that the held-out error is larger with the findings"""
+    - `worse`: probability that the held-out error is larger with the findings
+    - `remains`: the largest probability of a remainder at an output
+    - `flow`: probability that a flow is missing which no output shows alone"""
 
     something: float
     known: float
     named: tuple[Key, ...]
     over_noise: float
     worth: float
-    remains: float = 0.0
     worse: float = 0.0
+    remains: float = 0.0
     flow: float = 0.0
 
 
@@ -113,16 +113,8 @@ ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
 def decide(posterior: Probabilities, facts: Facts, limits: Thresholds) -> Decision:
     """Return the decision by the first row of ROWS whose condition holds."""
     row, verdict = next((text, verdict) for text, holds, verdict in ROWS if holds(facts, limits))
-    numbers = {
-        "something": facts.something,
-        "known": facts.known,
-        "over_noise": facts.over_noise,
-        "worth": facts.worth,
-        "worse": facts.worse,
-        "remains": facts.remains,
-        "flow": facts.flow,
-        **{f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named},
-    }
+    numbers = {k: v for k, v in vars(facts).items() if k != "named"}
+    numbers |= {f"{e} at {w}": posterior.effects[e, w] for e, w in facts.named}
     named = facts.named if verdict in ("explained", "partly_explained") else ()
     return Decision(verdict, named, alternatives(posterior, named, limits), row, numbers)
 
