@@ -46,21 +46,16 @@ class Channel:
         return len(self.band)
 
 
-def band_edges(rows: int) -> np.ndarray:
-    """Return the first row of each band, and the number of rows at the end."""
-    edges = list(range(min(SINGLE, rows)))
-    while edges[-1] < rows:
-        edges.append(max(edges[-1] + 1, int(edges[-1] * WIDTH)))
-    edges[-1] = rows
-    return np.array(edges)
-
-
 @lru_cache(maxsize=256)
-def _bands(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bands(rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the edges of the bands, the number of rows in each, and the band of each row.
 
-    Channels share these arrays."""
-    edges = band_edges(rows)
+    Edges are the first row of each band, and the number of rows at the end. Channels share these arrays."""
+    ends = list(range(min(SINGLE, rows)))
+    while ends[-1] < rows:
+        ends.append(max(ends[-1] + 1, int(ends[-1] * WIDTH)))
+    ends[-1] = rows
+    edges = np.array(ends)
     count = np.diff(edges)
     band = np.repeat(np.arange(len(count)), count)
     for shared in (edges, count, band):
@@ -80,7 +75,7 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     block = max(1, len(index) // (2 * most)) if most else 1
     n = len(index) // block
     rows = min(n, most or n)
-    edges, count, band = _bands(rows)
+    edges, count, band = bands(rows)
     middle = 0.5 * (edges[:-1] + edges[1:] - 1)
     span = float(d.t[index[-1]] - d.t[index[0]]) * n * block / max(len(index) - 1, 1)
     return Channel(r, j, index, block, band, count, np.maximum(middle, 0.5) / (2 * span), span / (n * block))
@@ -147,7 +142,6 @@ class Coordinates:
     def __init__(self, drives: Sequence[Excitation], most: int | None = None):
         channels = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))
         self.channels = [c for c in channels if c is not None]
-        self.recordings = len(drives)
 
     def by_output(self) -> dict[int, tuple[int, ...]]:
         """Return the positions of each measured output's channels, by output."""

@@ -37,7 +37,7 @@ import numpy as np
 from scipy.fft import dct
 from scipy.special import chdtri
 
-from thermoctl.diagnosis.data.coordinates import band_edges
+from thermoctl.diagnosis.data.coordinates import bands
 from thermoctl.plant.fitting.cores import each_of
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.fitting.residuals import Problem
@@ -204,8 +204,7 @@ def _content(y: np.ndarray, chance: float) -> int:
     # the straight line between the ends would put a 1 / f^2 tail into all rows
     power = dct(y - np.linspace(y[0], y[-1], len(y)), norm="ortho") ** 2
     floor = float(np.mean(power[len(power) // 2 :]))
-    edges = band_edges(len(power))
-    count = np.diff(edges)
+    edges, count, _ = bands(len(power))
     mean = np.add.reduceat(power, edges[:-1]) / count
     loud = edges[1:][mean > floor * (WHITE - 1 + chdtri(count, chance / len(count)) / count)]
     lines = np.flatnonzero(power > floor * chdtri(1, chance / len(power))) + 1

@@ -54,9 +54,10 @@ def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
     scores = {}
     for i, node in enumerate(reach.nodes):
         by_cell = np.zeros(len(reach.share))
-        variances = reach.cells(case.coordinates, [g.channels for g in case.grids], i)
-        for g, own, cells in zip(case.grids, f.average.sensor, variances, strict=True):
-            count = np.concatenate([case.coordinates.channels[k].count for k in g.channels])
+        for g, own in zip(case.grids, f.average.sensor, strict=True):
+            channels = [(k, case.coordinates.channels[k]) for k in g.channels]
+            cells = np.concatenate([reach.cells(k, c, i) for k, c in channels], axis=1)
+            count = np.concatenate([c.count for _, c in channels])
             power = np.concatenate([f.powers[k] for k in g.channels])
             by_cell -= 0.5 * (count * np.log(own + cells) + power / (own + cells)).sum(axis=1)
         scores[node] = float(logsumexp(by_cell))

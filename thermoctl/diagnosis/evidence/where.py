@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import idct
 
-from thermoctl.diagnosis.data.coordinates import Coordinates, band_edges, transform
+from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, bands, transform
 from thermoctl.diagnosis.data.spectra import first_order
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Flow, Plant
@@ -37,19 +37,8 @@ class Responses:
     corner: np.ndarray  # (cells,) tau
     intervals: list[float]  # s, sampling interval by recording
 
-    def cells(
-        self, coordinates: Coordinates, outputs: Sequence[Sequence[int]], node: int
-    ) -> list[np.ndarray]:
-        """Return the variances (cells, bands) by output that forces at one node cause.
-
-        `outputs`: for each output, the positions of its channels."""
-        return [
-            np.concatenate([self._channel(coordinates, k, node) for k in positions], axis=1)
-            for positions in outputs
-        ]
-
-    def _channel(self, coordinates: Coordinates, k: int, node: int) -> np.ndarray:
-        c = coordinates.channels[k]
+    def cells(self, k: int, c: Channel, node: int) -> np.ndarray:
+        """Return the variances (cells, bands) of channel c, at position k, that forces at one node cause."""
         interval = self.intervals[c.recording]
         slow = [first_order(tau / interval, 2 * np.pi * c.frequency * interval) for tau in self.corner]
         return self.share[:, None] ** 2 * self.white[k][node] * np.array(slow)
@@ -83,7 +72,7 @@ def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> d
 
 def white_forces(n: int) -> np.ndarray:
     """Return forces (n, FORCES) that contain each DCT row once, with size 1 and a fixed random sign."""
-    band = np.repeat(np.arange(len(band_edges(n)) - 1), np.diff(band_edges(n)))
+    *_, band = bands(n)
     rows = np.zeros((n, FORCES))
     rows[np.arange(n), band % FORCES] = np.random.default_rng(23).choice([-1.0, 1.0], n)
     return idct(rows, axis=0, norm="ortho")
