@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace as Part
 
-from thermoctl.diagnosis.law.curve import curve
+from thermoctl.diagnosis.law.find import curve
 from thermoctl.plant.expression import mul, name, num
 
 

@@ -181,13 +181,13 @@ def _law(
     asked: Mapping[Key, float],
 ) -> FoundLaw | None:
     """Return the law among the names, with its gain over the best hypothesis without it."""
-    placed = law_of(best)
-    if placed is None or placed.key not in decision.named:
+    law = law_of(best)
+    if law is None or law.key not in decision.named:
         return None
-    key, mine = placed.key, best.hypothesis.keys
+    key, mine = law.key, best.hypothesis.keys
     without = max((w for keys, w in tried.items() if keys < mine and key not in keys), key=lambda w: w.score)
     gain = tried[mine].score - without.score
-    return found_law(known, best, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))
+    return found_law(known, best, law, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

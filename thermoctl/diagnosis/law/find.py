@@ -1,4 +1,4 @@
-"""The law of a diagnosis, and the refits of proposed laws."""
+"""The law of a diagnosis, its curve, and the refits of proposed laws."""
 
 from __future__ import annotations
 
@@ -6,27 +6,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.law.curve import Curve, curve
+from thermoctl.diagnosis.law.free import PIECES, pieces
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import (
     SIMPLER,
     PlacedLaw,
     affordable,
     at_bound,
-    law_of,
     law_rate,
     refitted_law,
     simpler_law,
 )
-from thermoctl.diagnosis.law.smooth import law_unit, tracked
+from thermoctl.diagnosis.law.signals import Signal
+from thermoctl.diagnosis.law.smooth import Tracked, law_unit, tracked
 from thermoctl.diagnosis.search.beam import SPREAD
 from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, batches, each
+from thermoctl.plant.language import Plant
 
 SURE = 3  # number of refits of a case that tell how far its promises are right
+SEEN = 0.01  # least singular value of a direction of the free function that is drawn, over the largest one
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,15 @@ class Goal:
     quiet: bool
 
 
-Tried = tuple[Proposal, Fitted]
+@dataclass(frozen=True)
+class Curve:
+    """The missing flow as a free function of a signal, its sd, and the law, at visited values `at` (k,)."""
+
+    signal: Signal
+    at: np.ndarray
+    flow: np.ndarray
+    sd: np.ndarray
+    law: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -77,33 +89,53 @@ class FoundLaw:
         """Return its share of the posterior probability of all laws at its place."""
         return 1.0 - sum(share for _, _, share in self.rivals)
 
-    @property
-    def rate(self) -> ex.Expr:
-        """Return the expression of the law's flow, or of the storage that contains the law."""
-        return law_rate(self.fitted)
-
 
 def found_law(
-    case: Case, f: Fitted, parent: Fitted, gain: float, probability: float, confirmed: float
-) -> FoundLaw | None:
-    """Return the law of a hypothesis, None where it has none. `parent`: the hypothesis without it."""
-    law = law_of(f)
-    if law is None:
-        return None
+    case: Case, f: Fitted, law: PlacedLaw, parent: Fitted, gain: float, probability: float, confirmed: float
+) -> FoundLaw:
+    """Return the law of a hypothesis with its curve. `parent`: the hypothesis without it."""
     p = law.proposal
     drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f), f.plant)
     return FoundLaw(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
 
 
+def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
+    """Return the flow at the law's place as a free function of its first signal, and the law there.
+
+    None for a law with a memory or of a storage. None, too, if the plant without it lacks one of its signals:
+    a lag of a sensor that was found beside it makes such signals. The free function is the law plus a fit to
+    its residual."""
+    signals = [s for t in p.terms for s in t.signals]
+    if not signals or p.place.part != "flow" or any(t.form.memory for t in p.terms):
+        return None
+    s = signals[0]
+    parameters = {q: v.value for q, v in plant.parameters.items()}
+    if not ex.names(rate) <= {*linear.metric.signals[0], *parameters, "t"}:
+        return None
+    values = linear.along(s.along)
+    flows = linear.along(lambda run, t: ex.series(rate, {**run, **parameters}, t))
+    knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, PIECES + 4)))
+    parts = [pieces(v, knots) for v in values]
+    whole = np.concatenate(parts)
+    line = np.linalg.lstsq(whole, np.concatenate(flows), rcond=None)[0]
+    rest = linear.target - linear.columns(p.place, [q[:, None] for q in flows])[:, 0]
+    u, w, v = np.linalg.svd(linear.columns(p.place, parts), full_matrices=False)
+    seen = w > SEEN * w[0]  # the plant's own parameters absorb the others
+    noise = max(float(np.mean(rest**2)), 1.0)
+    extra = v[seen].T @ ((u.T @ rest)[seen] / w[seen])
+    sd = np.sqrt(noise * ((v[seen].T / w[seen]) ** 2).sum(axis=1))
+    return Curve(s, knots, line + extra, sd, line)
+
+
 def refits(
     case: Case, parent: Fitted, proposals: Sequence[Proposal], goal: Goal, say: Callable[[str], None]
-) -> list[Tried]:
+) -> list[tuple[Proposal, Fitted]]:
     """Refit the proposals that may beat the best law so far.
 
     From the best sum, and from one with an insignificant term, the least significant term is left out.
     All promises are multiplied by the largest ratio so far of a refit's gain to its promise. Beside a best
     hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
-    tried: list[Tried] = []
+    tried = list[tuple[Proposal, Fitted]]()
     queue, more = list(proposals), SIMPLER
     goal, ratios = replace(goal, least=max(goal.least, 0.0)), list[float]()
     leader, left, ahead = parent, affordable(case, parent), goal.least

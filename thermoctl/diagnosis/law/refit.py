@@ -157,11 +157,11 @@ def at_bound(f: Fitted) -> bool:
     return any(set(names) & f.fit.at_bound.keys() for names in own)
 
 
-def equation(rate: ex.Expr, f: Fitted) -> str:
-    """Return a law's flow with short names of its parameters."""
+def equation(f: Fitted) -> str:
+    """Return the flow of the last law of a hypothesis with short names of its parameters."""
     law = law_of(f)
     assert law is not None
-    c, text = law.candidate, readable(rate)
+    c, text = law.candidate, readable(law_rate(f))
     for q in c.effect.parameters:
         text = re.sub(rf"\b{re.escape(c.own(q.name))}\b", q.name, text)
     return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)

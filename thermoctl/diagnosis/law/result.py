@@ -14,7 +14,7 @@ from thermoctl.diagnosis.evidence.held_out import Worth
 from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.propose import Proposal
-from thermoctl.diagnosis.law.refit import equation, law_rate
+from thermoctl.diagnosis.law.refit import equation
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
 from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.files.safe_file import make_folder, write_text
@@ -33,7 +33,7 @@ def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
     return {
         "where": place.where,
         "part": place.part,
-        "expression": equation(law.rate, f),
+        "expression": equation(f),
         "into": place.target,
         "from": place.source,
         "terms": [str(t.expression(k)) for k, t in enumerate(p.terms, 1)],
@@ -92,7 +92,7 @@ def family(law: FoundLaw) -> list[str]:
 
 def described(p: Proposal, f: Fitted) -> str:
     """Return a law as an expression with its place."""
-    return f"{equation(law_rate(f), f)} at {p.place.where}"
+    return f"{equation(f)} at {p.place.where}"
 
 
 def law_section(law: FoundLaw | None, entry: Mapping[str, Any] | None) -> str:
