@@ -10,6 +10,7 @@ from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, Rig
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Node, Plant
+from thermoctl.plant.simulation.simulate import filled
 
 
 class Trajectory:
@@ -19,7 +20,7 @@ class Trajectory:
         d, run = metric.drives[r], metric.runs[r]
         self.recording, self.drive, self.run = r, d, run
         self.values: dict[str, np.ndarray | float] = {
-            **{c: _hold(rig.columns[r][c]) for c in rig.spare},
+            **{c: filled(d.t, rig.columns[r][c], False, c) for c in rig.spare},
             **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
             **metric.signals[r],
         }
@@ -41,12 +42,6 @@ class Trajectory:
     def value(self, e: ex.Expr, extra: Mapping[str, np.ndarray | float]) -> np.ndarray:
         """Return the values (N,) of an expression along the trajectory. `extra`: further names."""
         return ex.series(e, {**self.values, **extra}, self.drive.t)
-
-
-def _hold(column: np.ndarray) -> np.ndarray:
-    good = np.isfinite(column)
-    index = np.maximum.accumulate(np.where(good, np.arange(len(column)), -1))
-    return column[np.where(index < 0, int(np.argmax(good)), index)]
 
 
 class Overlay:

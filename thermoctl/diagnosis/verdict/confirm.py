@@ -62,10 +62,8 @@ class Blocks:
         self.count = np.zeros((recordings, BLOCKS, outputs))
         draws = np.zeros(outputs)
         for r, d in enumerate(problem.excitations):
-            run = log.model.run(d, values[r], dx0[r], sensitivities=True, states=False)
-            used, unknowns, slope = problem.slopes(r, values[r])
-            assert run.dy is not None
-            x = np.concatenate([run.dy[:, :, used] * slope, (d.y - run.y)[:, :, None]], axis=2)
+            unknowns, y, slopes = problem.jacobian(r, values[r], dx0[r])
+            x = np.concatenate([slopes, (d.y - y)[:, :, None]], axis=2)
             x /= sigma[:, None]
             good = np.isfinite(d.y)
             if not np.isfinite(x[good]).all():

@@ -142,7 +142,7 @@ class Model:
             raise InputError(f"{text}; a constant input can be a parameter of the plant")
         for j, i in enumerate(self.plant.inputs.values()):
             column = table.columns[i.column]
-            u[:, j] = _filled(t, column, i.linear, f"{table.path}: column '{i.column}' (input '{i.name}')")
+            u[:, j] = filled(t, column, i.linear, f"{table.path}: column '{i.column}' (input '{i.name}')")
             linear[j] = i.linear
             first[i.name] = float(column[np.isfinite(column)][0])
         y = np.full((len(t), len(self.outputs)), np.nan)
@@ -528,7 +528,10 @@ def compile_plant(plant: Plant, active: tuple[str, ...] | None = None) -> Model:
     return Model(plant, machine_code(plant, tuple(active)))
 
 
-def _filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.ndarray:
+def filled(t: np.ndarray, column: np.ndarray, linear: bool, what: str) -> np.ndarray:
+    """Return a column with its gaps filled: on straight lines, or each by the value before it.
+
+    Raises InputError with the name `what` where there is no value at all."""
     good = np.isfinite(column)
     if good.all():
         return column
