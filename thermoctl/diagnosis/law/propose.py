@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,7 @@ from thermoctl.diagnosis.law.free import (
 from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.search.again import chunks
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -189,25 +190,13 @@ def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequ
     duration = max(float(d.t[-1]) for d in linear.metric.drives)
     sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
-    for part in _chunks(families(first, every, duration, sample)):
+    for part in chunks(families(first, every, duration, sample), lambda f: f.count, CHUNK):
         of_families = zip(*(linear.along(f.values) for f in part), strict=True)
         x = linear.columns(place, [np.concatenate(q, axis=1) for q in of_families])
         ends = np.cumsum([f.count * len(f.form.sizes) for f in part])
         for f, own in zip(part, np.split(x, ends[:-1], axis=1), strict=True):
             out += _best(linear, place, f, own, still if f.signals else np.zeros_like(still))
     return out
-
-
-def _chunks(every: Sequence[Family]) -> Iterator[list[Family]]:
-    """Yield families in groups of CHUNK terms and more."""
-    part: list[Family] = []
-    for f in every:
-        part.append(f)
-        if sum(q.count for q in part) >= CHUNK:
-            yield part
-            part = []
-    if part:
-        yield part
 
 
 def _best(linear: Tracked, place: Place, f: Family, x: np.ndarray, still: np.ndarray) -> list[Found]:

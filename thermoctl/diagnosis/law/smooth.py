@@ -22,6 +22,7 @@ from scipy.sparse import csr_matrix
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.noise import Around
 from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
@@ -64,9 +65,12 @@ class Tracked:
         return sorted(explained, key=lambda n: -explained[n])
 
     @cached_property
-    def above(self) -> Callable[[np.ndarray], float]:
-        """Return a function of other rows: their log likelihood minus that of the target."""
-        return self.metric.rise(self.target)
+    def _around(self) -> Around:
+        return Around(self.metric.plain.grids, self.metric.powers(self.target))
+
+    def above(self, rows: np.ndarray) -> float:
+        """Return the log likelihood of other whitened rows minus that of the target."""
+        return self._around.rise(self.metric.powers(rows))
 
     def along(self, values: Callable[[Values, np.ndarray], np.ndarray]) -> list[np.ndarray]:
         """Return by recording what `values` gives for the signals along the trajectory, and their times."""

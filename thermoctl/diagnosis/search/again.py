@@ -6,9 +6,9 @@ from the present residual and metric. Only the directions with the largest gains
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from thermoctl.diagnosis.search.sketch import foremost_groups
 KEPT = 288  # columns that are simulated again, at most
 LIKE = 0.1  # largest change of an output, over its swing, for which the plant moves as before
 CHUNK = 480  # columns whose rows are whitened together
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -62,13 +64,8 @@ class Known:
         flat, sizes = np.concatenate(self.rows, axis=1), np.concatenate(self.sizes)
         found: list[Direction | None] = []
         known = [g for g in groups if self._columns(g) is not None]
-        at_once, count = list[Group](), 0
-        for g in known:
-            at_once.append(g)
-            count += len(g.sizes)
-            if g is known[-1] or count >= CHUNK:
-                found += self._scored(metric, flat, sizes, at_once)
-                at_once, count = [], 0
+        for at_once in chunks(known, lambda g: len(g.sizes), CHUNK):
+            found += self._scored(metric, flat, sizes, at_once)
         kept = foremost_groups(known, found, KEPT)
         return [g for g in groups if self._columns(g) is None] + [known[i] for i in sorted(kept)]
 
@@ -92,6 +89,18 @@ class Known:
             score(list(g.columns()), rows[:, part], products[part], full[part], best)
             out.append(next((d for d in best.values() if d.gain > 0), None))
         return out
+
+
+def chunks(items: Iterable[T], size: Callable[[T], int], least: int) -> Iterator[list[T]]:
+    """Yield the items in lists whose sizes sum to `least` or more; the last one may be smaller."""
+    part: list[T] = []
+    for item in items:
+        part.append(item)
+        if sum(map(size, part)) >= least:
+            yield part
+            part = []
+    if part:
+        yield part
 
 
 def _name(candidate: Any, number: Any) -> tuple[Any, ...]:

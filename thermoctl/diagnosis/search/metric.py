@@ -214,13 +214,6 @@ class Metric:
         x = transforms(self.plain.channels[r], e)
         return x * weight.reshape(-1, *([1] * (x.ndim - 1)))
 
-    def rise(self, rows: np.ndarray) -> Callable[[np.ndarray], float]:
-        """Return a function of other rows: their log likelihood minus that of these rows.
-
-        Rows are whitened, of all recordings; noise and remainder are averaged."""
-        around = Around(self.plain.grids, self.powers(rows))
-        return lambda others: around.rise(self.powers(others))
-
     def weighed(self, rows: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log likelihood of other rows minus that of the residual, and new weights (rows,).
 
