@@ -39,9 +39,9 @@ from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.run import diagnose_files
-from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction, parameter_values
 from thermoctl.diagnosis.search.overlay import Trajectory
+from thermoctl.diagnosis.search.refits import extend
 from thermoctl.diagnosis.search.screen import groups_of, sharpened
 from thermoctl.diagnosis.search.screening import screened
 from thermoctl.files.yamlfile import InputError

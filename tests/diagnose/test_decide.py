@@ -44,9 +44,7 @@ def test_a_small_remainder_that_is_certain_is_not_nothing():
 def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
     posterior = weighed(scores)
     found = decide(
-        posterior,
-        Facts(posterior.something, posterior.something, named, over_noise, 1.0, worse),
-        limits(),
+        posterior, Facts(posterior.something, posterior.something, named, over_noise, 1.0, worse), limits()
     )
     assert found.verdict == verdict
     assert (found.named == named) == (verdict in ("explained", "partly_explained") or not named)

@@ -15,8 +15,8 @@ from thermoctl.diagnosis.evidence.fit import Placed, Posterior, fitted, log_dens
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.search.extend import extend
 from thermoctl.diagnosis.search.gains import Direction
+from thermoctl.diagnosis.search.refits import extend
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table

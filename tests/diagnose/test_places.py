@@ -10,9 +10,8 @@ from tests.plants import FREE_CARRIAGE
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.search.extend import ranges_of
 from thermoctl.diagnosis.search.gains import Direction
-from thermoctl.diagnosis.search.refits import free_starts
+from thermoctl.diagnosis.search.refits import free_starts, ranges_of
 from thermoctl.diagnosis.search.shapes import shape_grid
 from thermoctl.plant import loads
 from thermoctl.plant.language import Plant

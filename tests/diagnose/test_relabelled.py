@@ -12,11 +12,10 @@ from tests.plants import TWO_BLOCKS
 from thermoctl.checks import checks
 from thermoctl.checks.labels import swaps
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.data.columns import changed
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.relabelled import absurd, better_unfitted, relabelled
+from thermoctl.diagnosis.relabelled import absurd, better_unfitted, changed, relabelled
 from thermoctl.plant import load, loads
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.simulate import compile_plant

@@ -14,8 +14,7 @@ import numpy as np
 
 from thermoctl.checks.labels import swaps
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.data.columns import changed
-from thermoctl.diagnosis.relabelled import better_unfitted
+from thermoctl.diagnosis.relabelled import better_unfitted, changed
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings

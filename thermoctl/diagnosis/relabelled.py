@@ -17,6 +17,7 @@ for effects.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from math import exp, log
 
@@ -24,15 +25,18 @@ import numpy as np
 
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
-from thermoctl.diagnosis.data.case import Budget, Case
-from thermoctl.diagnosis.data.columns import changed, unfitted_cost
+from thermoctl.diagnosis.data.case import ROUGH, Budget, Case, grids_of
+from thermoctl.diagnosis.data.coordinates import Coordinates
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
 from thermoctl.files.yamlfile import InputError
-from thermoctl.plant.simulation.simulate import SimulationError
+from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.simulation.simulate import Excitation, SimulationError
+from thermoctl.recording.table import Table
 
 # Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
 # degC.
@@ -100,6 +104,37 @@ def better_unfitted(known: Case, pairs: Sequence[Hypothesis]) -> list[Hypothesis
     recorded = unfitted_cost(known, known.tables)
     costs = [(unfitted_cost(known, [h.change(t) for t in known.tables]), h) for h in pairs]
     return [h for cost, h in sorted(costs, key=lambda item: item[0]) if cost < recorded]
+
+
+def unfitted_cost(known: Case, tables: Sequence[Table]) -> float:
+    """Return the cost of recordings at the plant file's own values; infinite where there is no simulation."""
+    try:
+        problem = Problem(known.null.model, _drives(known, tables), known.noise)
+        return problem.evaluate(problem.start({}), False).cost
+    except (SimulationError, InputError):
+        return np.inf
+
+
+def changed(known: Case, tables: Sequence[Table], goal: float, budget: Budget) -> Case | None:
+    """Return the case with changed columns in the same rows, so that log evidences can be compared.
+
+    Nothing is averaged or left out again. None if the cost of the refit stays above `goal`.
+    Raises SimulationError."""
+    drives = _drives(known, tables)
+    null = fit(
+        known.null.model, drives, known.noise, iterations=40, tolerance=ROUGH, seconds=np.inf, goal=goal
+    )
+    if null.cost > goal:
+        return None
+    coordinates = Coordinates(drives)
+    grids = grids_of(coordinates, drives, null, known.block)
+    return dataclasses.replace(
+        known, tables=tuple(tables), null=null, coordinates=coordinates, grids=grids, budget=budget
+    )
+
+
+def _drives(known: Case, tables: Sequence[Table]) -> list[Excitation]:
+    return [dataclasses.replace(known.null.model.excitation(t), rtol=known.rtol) for t in tables]
 
 
 def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:

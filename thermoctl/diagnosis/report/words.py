@@ -5,12 +5,9 @@ The words of a sentence depend on the numbers in it as they are shown, rounded (
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from thermoctl.diagnosis.report.figures import Output, chance, outputs, size, with_interval
-
-Result = Mapping[str, Any]  # the content of diagnosis.json
+from thermoctl.diagnosis.report.figures import Output, Result, chance, outputs, size, with_interval
 
 NEXT = {
     "consistent": "Nothing has to be done. Effects that these inputs do not excite would not show: record wider steps to exclude them.",
