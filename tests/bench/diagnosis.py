@@ -50,7 +50,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import load
 from thermoctl.plant.fitting.estimate import report
 from thermoctl.plant.recordings import read_recordings
-from thermoctl.plant.simulation.simulate import Excitation, SimulationError
+from thermoctl.plant.simulation.simulate import SimulationError
 
 SHORT, MOST = 8, 3
 
@@ -106,12 +106,10 @@ def white(f: Fitted) -> tuple[float, int]:
     return total, n
 
 
-def extended(
-    known: Case, current: Fitted, direction: Direction, drives: Sequence[Excitation]
-) -> Fitted | None:
+def extended(known: Case, current: Fitted, direction: Direction) -> Fitted | None:
     """The current plant with one more effect, refitted in white noise; None where that cannot be simulated."""
     try:
-        plant, own = extend(current.plant, direction, drives)
+        plant, own = extend(direction)
         effects = (*current.hypothesis.effects, Placed(direction.candidate, own))
         return as_refitted(known, fitted(known, plant, effects))
     except (SimulationError, InputError, np.linalg.LinAlgError):
@@ -139,7 +137,7 @@ def bic(job: Job) -> dict[str, Any]:
         best, margin = None, 0.0
         now, samples = white(current)
         for d in list(first.values())[:SHORT]:
-            rival = extended(known, current, d, looked.metric.drives)
+            rival = extended(known, current, d)
             if rival is None:
                 continue
             price = float(np.log(samples)) * len(rival.hypothesis.effects[-1].own)
@@ -179,7 +177,7 @@ def sindy(job: Job) -> dict[str, Any]:
         usable = [k for k, parts in enumerate(forces) if all(i in f for f in parts)]
         features = [[f[i] for f in forces[k]] for k in usable]
         for column, coefficient, share in _sparse(target, features, [columns[k] for k in usable]):
-            c, _, (shape, dim), _ = column.item
+            c, shape, dim = column.candidate, column.shape, column.dim
             start = parameter_values(c, shape, [coefficient * v for v in dim])
             if c.key not in chosen or share > chosen[c.key][0]:
                 chosen[c.key] = (share, c, {**shape, "": 0.0, **{f"={k}": v for k, v in start.items()}})
@@ -193,7 +191,7 @@ def sindy(job: Job) -> dict[str, Any]:
             1,
             start,
         )
-        current = extended(known_case, current, direction, drives) or current
+        current = extended(known_case, current, direction) or current
     return told(known_case, base, current)
 
 
@@ -248,7 +246,7 @@ def _sparse(
         x = np.concatenate(column)
         size = float(np.linalg.norm(x))
         like = abs(float(x @ y)) / size if size > 0 else 0.0
-        key = usable[k].item[0].key
+        key = usable[k].candidate.key
         if size > 0 and (key not in best or like > best[key][0]):
             best[key] = (like, k)
     take = [k for _, k in best.values()]

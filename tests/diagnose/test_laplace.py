@@ -69,7 +69,7 @@ def _extended(plant, table: Table, effect: str, values: dict[str, float]):
     rig = Rig(plant, [drive], [table.columns])
     c = _candidate(rig, effect)
     shape = {p.shape: values[p.name] for p in c.effect.parameters if p.shape}
-    return extend(plant, Direction(c, shape, 100.0, 1, values), [drive]), c
+    return extend(Direction(c, shape, 100.0, 1, values)), c
 
 
 @pytest.mark.parametrize("name", list(PROBLEMS))

@@ -96,7 +96,7 @@ def test_a_period_that_has_not_come_twice_is_not_offered():
     start = {p.name: p.null for p in found.effect.parameters}
     for shape in grid:
         direction = Direction(found, shape, 1.0, 2, {**start, "P": shape["period"]})
-        ranges = ranges_of(direction, 8.0)
+        ranges = ranges_of(direction)
         assert ranges["P"][1] <= 1.001 * travel / 2
         assert np.ptp(ranges["PHI"]) == pytest.approx(2 * np.pi)
 
@@ -112,7 +112,7 @@ def test_the_prior_of_a_limit_depends_on_what_the_signal_visits_and_not_on_the_z
     )
     runs = [model.run(drive)]
     spans = {
-        ranges_of(Direction(found, shape, 1.0, 1, {"YMAX": shape["level"]}), 3000.0)["YMAX"]
+        ranges_of(Direction(found, shape, 1.0, 1, {"YMAX": shape["level"]}))["YMAX"]
         for shape in shape_grid("end_levels", found, runs)
     }
     y = runs[0].y[:, 0] - zero

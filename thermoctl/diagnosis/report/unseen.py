@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ class Visible:
 def not_seen(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return `not_seen` of a result: the smallest size of each effect that would have shown."""
     null = next(w.fitted for w in diagnosis.searched.tried if not w.fitted.hypothesis.effects)
-    norms = [n for n in diagnosis.searched.norms if sized(n.column.item[0].effect)]
+    norms = [n for n in diagnosis.searched.norms if sized(n.column.candidate.effect)]
     seen = _best((n, None) for n in norms) if norms else visible(diagnosis.case, null, diagnosis.null.average)
     return [v.entry() for v in seen if v.reason is None]
 
@@ -103,9 +103,7 @@ def _best(norms: Iterable[tuple[Norms, Rms | None]]) -> list[Visible]:
     """Return the most visible size of each effect at each place."""
     best: dict[tuple[str, str], Visible] = {}
     for n, rms in norms:
-        new = _visible(n.column, n.whole, n.left)
-        if rms and new.reason is None:
-            new = replace(new, moves=_moves(rms, _times(n.column, n.left)))
+        new = _visible(n, rms)
         old = best.get(new.candidate.key)
         if old is None or (new.reason is not None, new.smallest) < (old.reason is not None, old.smallest):
             best[new.candidate.key] = new
@@ -115,12 +113,6 @@ def _best(norms: Iterable[tuple[Norms, Rms | None]]) -> list[Visible]:
 def _moves(rms: Rms, times: float) -> tuple[str, float, float]:
     name = max(rms, key=lambda o: rms[o][0] / rms[o][1])
     return name, times * rms[name][0], times * rms[name][0] / rms[name][1]
-
-
-def _times(column: Column, left: float) -> float:
-    """Return the smallest visible size as a multiple of the direction's size at s = 1."""
-    sized_ = any(p.amplitude for p in column.item[0].effect.parameters)
-    return SEEN / left if sized_ else max(SEEN / left, 1 / NEAR)
 
 
 def _norms(
@@ -152,23 +144,26 @@ def _energies(metric: Metric, plain: np.ndarray) -> dict[int, np.ndarray]:
     return energies
 
 
-def _visible(column: Column, full: float, left: float) -> Visible:
-    c, _, (shape, dim), _ = column.item
+def _visible(n: Norms, rms: Rms | None) -> Visible:
+    """Return the smallest visible size of a column, and the output that it moves most if `rms` is known."""
+    c, shape, dim = n.column.candidate, n.column.shape, n.column.dim
     sizes = [p for p in c.effect.parameters if p.amplitude]
-    if full < STILL:
+    if n.whole < STILL:
         return Visible(c, "", np.inf, NOT_EXCITED)
-    if left < ABSORBED * full:
+    if n.left < ABSORBED * n.whole:
         return Visible(c, "", np.inf, IMITATED)
+    times = SEEN / n.left  # the smallest size as a multiple of that at s = 1
     if sizes:
         absent = parameter_values(c, shape, [0.0 for _ in dim])
-        values = parameter_values(c, shape, [SEEN / left * v for v in dim])
+        values = parameter_values(c, shape, [times * v for v in dim])
         p = next(p for p in sizes if values[p.name] != absent[p.name])
-        smallest, most = (
-            abs(values[p.name] - absent[p.name]),
-            max(abs(np.array(c.bounds(p)) - absent[p.name])),
-        )
-        return Visible(c, p.name, smallest, TOO_LARGE if smallest > most else None)
-    # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
-    p = next(p for p in c.effect.parameters if p.shape)
-    smallest = column.item[2][0][str(p.shape)] * max(SEEN / left, 1 / NEAR)
-    return Visible(c, p.name, smallest, TOO_LARGE if left < SEEN else None)
+        smallest = abs(values[p.name] - absent[p.name])
+        too_large = smallest > max(abs(np.array(c.bounds(p)) - absent[p.name]))
+    else:
+        # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
+        times = max(times, 1 / NEAR)
+        p = next(p for p in c.effect.parameters if p.shape)
+        smallest, too_large = shape[str(p.shape)] * times, n.left < SEEN
+    if too_large:
+        return Visible(c, p.name, smallest, TOO_LARGE)
+    return Visible(c, p.name, smallest, moves=_moves(rms, times) if rms else None)

@@ -45,8 +45,7 @@ class Known:
         self.rows.append((rows / np.where(size > 0, size, 1.0)).astype(np.float16))
         self.sizes.append(size)
         for k, column in enumerate(columns):
-            candidate, number, *_ = column.item
-            self.place.setdefault(_name(candidate, number), self.count + k)
+            self.place.setdefault(_name(column.candidate, column.group), self.count + k)
         self.count += len(columns)
 
     def like(self, metric: Metric) -> bool:

@@ -70,12 +70,16 @@ def log_p(gain: float, dims: int) -> float:
 
 @dataclass(frozen=True)
 class Column:
-    """The recipe of a direction: an effect at one shape, along one direction of its amplitudes.
+    """The recipe of a direction: an effect at one shape, along one direction `dim` of its amplitudes.
 
-    item = (candidate, group, (shape, dim), number of columns in the group). `values`: the plant's parameters
+    `group`: its group of the candidate; `count`: number of columns in it. `values`: the plant's parameters
     with a small amplitude; `scale`: the factor from the change at this amplitude to that at amplitude 1."""
 
-    item: tuple[Any, ...]
+    candidate: Candidate
+    group: Any
+    shape: dict[str, float]
+    dim: tuple[float, ...]
+    count: int
     overlay: Callable[[], Overlay]
     values: Mapping[str, float]
     scale: float
@@ -124,9 +128,9 @@ def score(
     - `rows` (rows, k): the columns after projection, or sketches with about the same inner products
     - `g` (k,): products of the columns with the residual; `full` (k,): norms of the columns before
       projection"""
-    c, m = columns[0].item[0], rows.T @ rows
+    c, m = columns[0].candidate, rows.T @ rows
     if "windows" in c.effect.shapes.values():
-        _score_windows(c, columns, rows, full, g, m, best)
+        _score_windows(columns, rows, full, g, m, best)
         return
     left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
     useful = (left > 1e-4) & (full > 1e-9)
@@ -138,30 +142,27 @@ def score(
     inverse = 1 / sub if len(sub) == 1 else np.linalg.pinv(sub, rcond=1e-8, hermitian=True)
     inverse = inverse / np.outer(scale[useful], scale[useful])
     coefficient[useful] = inverse @ g[useful]
-    shape, _ = columns[0].item[2]
     if c.effect.prior is not None:
         useful_columns = [q for q, u in zip(columns, useful, strict=True) if u]
-        coefficient[useful] = _plausible(c, useful_columns, coefficient[useful], inverse)
+        coefficient[useful] = _plausible(useful_columns, coefficient[useful], inverse)
     if len(g) == 1:
-        coefficient[0] = _within(c, columns[0], float(coefficient[0]))
+        coefficient[0] = _within(columns[0], float(coefficient[0]))
     gain = float(2 * g @ coefficient - coefficient @ m @ coefficient)
-    if len(g) == 1 and not _possible(c, columns[0], float(coefficient[0])):
+    if len(g) == 1 and not _possible(columns[0], float(coefficient[0])):
         gain = 0.0
-    shape, s = _sizes(c, columns, shape, coefficient)
+    shape, s = _sizes(columns, coefficient)
     _keep(best, Direction(c, shape, gain, int(useful.sum()), {}), s, lambda: rows @ coefficient)
 
 
-def _plausible(
-    c: Candidate, columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray
-) -> np.ndarray:
+def _plausible(columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the coefficients with the best sum of fit and log prior of the entry.
 
     The other amplitudes are products with the first one. If the plant's parameters absorb the first one, the
     data do not determine its size and sign. Then the prior of the other amplitudes determines them."""
     from scipy.optimize import minimize_scalar  # slow to load, and only an entry with a prior needs it
 
-    shape, _ = columns[0].item[2]
-    dims = np.array([q.item[2][1] for q in columns])  # (columns, amplitudes)
+    c, shape = columns[0].candidate, columns[0].shape
+    dims = np.array([q.dim for q in columns])  # (columns, amplitudes)
     step = covariance @ dims[:, 0]
     size, variance = float(dims[:, 0] @ coefficient), float(dims[:, 0] @ step)
     typical, prior = float(np.abs(dims.T @ coefficient)[1:].max(initial=0.0)), c.effect.prior
@@ -184,48 +185,46 @@ def _plausible(
     return coefficients_at(float(minimize_scalar(cost, bounds=tuple(reach), method="bounded").x))
 
 
-def _possible(c: Candidate, column: Column, coefficient: float) -> bool:
+def _possible(column: Column, coefficient: float) -> bool:
     """Return whether the catalogue allows the size of a candidate that has only one column."""
+    c = column.candidate
     amplitudes = [p for p in c.effect.parameters if p.amplitude]
-    shape, _ = column.item[2]
     if amplitudes:
         return _allowed(amplitudes[0], coefficient)
-    if "tau" in shape and (column.item[1] != (0,) or (c.jumps and not c.variant)):
+    if "tau" in column.shape and (column.group != (0,) or (c.jumps and not c.variant)):
         # the change is in proportion to the lag only between neighbours of the grid
         return 1 / NEAR < coefficient < NEAR
     return coefficient > 0
 
 
-def _within(c: Candidate, column: Column, coefficient: float) -> float:
+def _within(column: Column, coefficient: float) -> float:
     """Return the coefficient of a candidate with only one column, clipped to the bounds of its amplitude.
 
     A coefficient of the wrong sign is not clipped: beside another effect the sign may turn
     (shortlist.pairs)."""
+    c = column.candidate
     p = next((p for p in c.effect.parameters if p.amplitude), None)
     if p is None:
         return coefficient
-    shape, dim = column.item[2]
     low, high = c.bounds(p)
-    value = parameter_values(c, shape, [coefficient * v for v in dim])[p.name]
+    value = parameter_values(c, column.shape, [coefficient * v for v in column.dim])[p.name]
     beyond = float(np.clip(value, low, high)) - p.null
     return coefficient * beyond / (value - p.null) if beyond * (value - p.null) > 0 else coefficient
 
 
-def _sizes(
-    c: Candidate, columns: Sequence[Column], shape: dict[str, float], coefficient: np.ndarray
-) -> tuple[dict[str, float], list[float]]:
+def _sizes(columns: Sequence[Column], coefficient: np.ndarray) -> tuple[dict[str, float], list[float]]:
     """Return the shape and the amplitudes at the best coefficients of the columns."""
+    c, shape = columns[0].candidate, columns[0].shape
     if "phases" in c.effect.shapes.values():
         phase = float(np.arctan2(coefficient[1], coefficient[0]))
         return {**shape, "phase": phase}, [float(np.hypot(*coefficient))]
     if any(p.amplitude for p in c.effect.parameters):
-        return shape, list(np.array([q.item[2][1] for q in columns]).T @ coefficient)
+        return shape, list(np.array([q.dim for q in columns]).T @ coefficient)
     factor = float(np.clip(coefficient[0], 1e-3, 5.0))  # a short lag changes the outputs in proportion
     return {k: v * factor if k == "tau" else v for k, v in shape.items()}, [1.0]
 
 
 def _score_windows(
-    c: Candidate,
     columns: Sequence[Column],
     rows: np.ndarray,
     full: np.ndarray,
@@ -234,7 +233,7 @@ def _score_windows(
     best: dict[int, Direction],
 ) -> None:
     """Keep the best pair of a start and an end. An end after the last column is the end of the recording."""
-    edges = [q.item[2][0]["start"] for q in columns]
+    edges = [q.shape["start"] for q in columns]
     last, floor = len(edges), 1e-12 * float(full.max()) ** 2
     gain, window = -1.0, (0, 0, 0.0)
     for a in range(last):
@@ -253,7 +252,7 @@ def _score_windows(
         gain = g[a] ** 2 / m[a, a]
     shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
     vector = rows[:, a] - (rows[:, b] if b < last else 0)
-    _keep(best, Direction(c, shape, gain, 1, {}), [amplitude], lambda: vector)
+    _keep(best, Direction(columns[0].candidate, shape, gain, 1, {}), [amplitude], lambda: vector)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:

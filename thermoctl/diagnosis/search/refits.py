@@ -21,7 +21,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import LEAST, each
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import Excitation, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor. A
 # second refit starts there, because an axis that sticks rests for a long time.
@@ -63,7 +63,7 @@ def _refitted(
             rig = case.rig(plant, drives)
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
             inputs = plant.inputs.keys()
-            plant, own = extend(plant, d, drives)
+            plant, own = extend(d)
             if not own:  # an earlier effect replaced the place it acts on, so that it would change nothing
                 return None
             if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
@@ -90,16 +90,16 @@ def free_starts(before: Plant, after: Plant) -> Plant:
     return dataclasses.replace(after, nodes=nodes)
 
 
-def ranges_of(direction: Direction, duration: float) -> dict[str, tuple[float, float]]:
+def ranges_of(direction: Direction) -> dict[str, tuple[float, float]]:
     """Return the ranges of the effect's parameters in a refit: wide about the estimate, in their bounds.
 
     The time of a jump after the recordings' end has none."""
-    ranges = {p.name: _range(direction, p, duration) for p in direction.candidate.effect.parameters}
+    ranges = {p.name: _range(direction, p) for p in direction.candidate.effect.parameters}
     return {n: (float(span[0]), float(span[1])) for n, span in ranges.items() if span}
 
 
-def _range(direction: Direction, p: EffectParameter, duration: float) -> tuple[float, float] | None:
-    value = direction.start[p.name]
+def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | None:
+    value, duration = direction.start[p.name], direction.candidate.rig.duration
     kind = direction.candidate.effect.shapes.get(p.shape or "", "")
     if p.shape in TIMES:
         return (0.0, duration) if value <= duration else None
@@ -145,10 +145,9 @@ def sticking(direction: Direction) -> Direction | None:
     return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
 
 
-def extend(base: Plant, direction: Direction, drives: Sequence[Excitation]) -> tuple[Plant, dict[str, str]]:
+def extend(direction: Direction) -> tuple[Plant, dict[str, str]]:
     """Return the plant with a screened effect at its starting values, and the names of its parameters."""
-    duration = max(float(d.t[-1]) for d in drives)
-    ranges = ranges_of(direction, duration)
+    ranges = ranges_of(direction)
     values: dict[str, float] = {}
     for p in direction.candidate.effect.parameters:
         value = direction.start[p.name] if p.typical is None else p.typical

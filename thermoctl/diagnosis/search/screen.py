@@ -76,10 +76,6 @@ Keep = Callable[[Sequence[Column], np.ndarray], None]
 Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
 
 
-def ignored(columns: Sequence[Column], rows: np.ndarray) -> None:
-    """Keep no rows."""
-
-
 def screen(
     metrics: Sequence[Metric],
     rig: Rig,
@@ -87,7 +83,7 @@ def screen(
     edges: np.ndarray | None = None,
     select: Select = lambda metrics, trajectories, groups: groups,
     norms: list[Norms] | None = None,
-    keep: Keep = ignored,
+    keep: Keep | None = None,
 ) -> list[list[Direction]]:
     """Return every candidate's best direction, best first, in each of the metrics.
 
@@ -104,7 +100,7 @@ def screen(
     pending: dict[tuple[Any, ...], list[Entry]] = {}
     columns = (column for g in groups for column in g.columns())
     for part, plain in directions(first, trajectories, columns):
-        if norms is not None:
+        if norms is not None and keep:
             keep(part, plain)
         for metric, leaders in zip(metrics, best, strict=True):
             rows = plain * metric.weight[:, None]
@@ -114,11 +110,10 @@ def screen(
                 left = np.linalg.norm(rows, axis=0)
                 norms += [Norms(*n) for n in zip(part, map(float, full), map(float, left), strict=True)]
             for column, own, norm in zip(part, np.ascontiguousarray(rows.T), map(float, full), strict=True):
-                candidate, group, _, count = column.item
-                key = (id(metric), id(candidate), group)
+                key = (id(metric), id(column.candidate), column.group)
                 entries = pending.setdefault(key, [])
                 entries.append((column, own, norm))
-                if len(entries) == count:
+                if len(entries) == column.count:
                     del pending[key]
                     _score_rows(entries, metric, leaders)
     return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
@@ -132,18 +127,17 @@ def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
     kinds = direction.candidate.effect.shapes.values()
     if "onsets" not in kinds and "windows" not in kinds:
         return direction
-    duration = max(float(d.t[-1]) for d in metric.drives)
-    step, sample = duration / ONSETS, min(float(np.median(np.diff(d.t))) for d in metric.drives)
-    while step > 0.5 * sample:
+    step = rig.duration / ONSETS
+    while step > 0.5 * rig.sample:
         near = np.concatenate(
             [
                 direction.shape[k] + step * np.arange(-4, 5) / 4
                 for k in ("onset", "start", "end")
-                if direction.shape.get(k, np.inf) <= duration
+                if direction.shape.get(k, np.inf) <= rig.duration
             ]
         )
         (better,) = screen(
-            [metric], rig, [direction.candidate], np.unique(near[(near >= 0) & (near < duration)])
+            [metric], rig, [direction.candidate], np.unique(near[(near >= 0) & (near < rig.duration)])
         )
         if better and better[0].gain > direction.gain:
             direction = better[0]
@@ -169,7 +163,7 @@ class Group:
         scale = 1 / EPSILON if any(p.amplitude for p in c.effect.parameters) else 1.0
         for shape, dim in self.sizes:
             own = {c.own(k): v for k, v in _values(c, shape, dim).items()}
-            yield Column((c, self.number, (shape, dim), len(self.sizes)), self.overlay, own, scale)
+            yield Column(c, self.number, shape, dim, len(self.sizes), self.overlay, own, scale)
 
 
 def _values(c: Candidate, shape: Mapping[str, float], dim: Sequence[float]) -> dict[str, float]:
@@ -188,7 +182,7 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
     }
     windowed = "windows" in effect.shapes.values()
     if windowed:
-        duration = max(float(d.t[-1]) for d in metric.drives)
+        duration = c.rig.duration
         grids["window"] = [
             {"start": float(v), "end": 10 * duration}
             for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)
@@ -205,7 +199,6 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
 
     @cache
     def overlay() -> Overlay:  # the groups share it: only their values differ
-        """Return the parts of the plant that the candidate changes."""
         return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]

@@ -17,7 +17,7 @@ from thermoctl.diagnosis.search.fine import above, fine
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
-from thermoctl.diagnosis.search.screen import Keep, Norms, Select, ignored, screen
+from thermoctl.diagnosis.search.screen import Norms, Select, screen
 from thermoctl.diagnosis.search.sketch import likeliest
 
 LOUD = 2.0  # residual's rms over the noise, from which energy is the better guide
@@ -74,7 +74,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
         known.outputs = [run.y for run in metric.runs]
     elif other is None and known.like(metric):
         select = known.likeliest
-    keep: Keep = ignored if known.count else known.add
+    keep = None if known.count else known.add
     best, *rest = screen(metrics, rig, placed, select=select, norms=norms, keep=keep)
     promised = [(d, _promise(metric, d)) for d in foremost(best, ROOM * PLACES_EACH)[:PROMISED]]
     by_energy = rest[0] if rest else []
