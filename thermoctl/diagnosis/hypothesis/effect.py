@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -91,11 +91,11 @@ class EffectParameter:
     high: float
     null: float
     trial: Expr | None
-    shape: str | None
-    per_recording: bool
-    typical: float | None
+    shape: str | None = None
+    per_recording: bool = False
+    typical: float | None = None
     # 'first_air': bounds are relative to the first ambient; 'exponent': null is the outlet's exponent.
-    origin: str | None
+    origin: str | None = None
     at_zero: bool = False
     of: str | None = None
 
@@ -116,14 +116,14 @@ class Effect:
     name: str
     title: str
     where: str
-    needs: tuple[str, ...]
     changes: tuple[tuple[Mapping[str, Any], ...], ...]  # the change and its variants
-    shapes: Mapping[str, str]
     parameters: tuple[EffectParameter, ...]
-    dims: tuple[tuple[float, ...], ...]
-    excited_by: str
-    mimics: tuple[str, ...]
-    source: str
+    needs: tuple[str, ...] = ()
+    shapes: Mapping[str, str] = field(default_factory=dict)
+    dims: tuple[tuple[float, ...], ...] = ((1.0,),)
+    excited_by: str = ""
+    mimics: tuple[str, ...] = ()
+    source: str = ""
     caution: str | None = None  # a sentence on the limits of such a finding
     prior: Expr | None = None  # -2 log prior of its parameters, inside their bounds
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
@@ -174,10 +174,10 @@ def read(root: Node) -> Effect:
         name,
         title,
         where,
-        needs,
         changes,
-        shapes,
         parameters,
+        needs,
+        shapes,
         dims,
         excited_by,
         mimics,

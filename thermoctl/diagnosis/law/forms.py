@@ -249,23 +249,11 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
     else:
         ends = {"into": "target", **({"from": "source"} if place.source else {})}
         changes.append({"flow": {**ends, "rate": str(rate)}})
-    return Effect(
-        LAW,
-        "A law that the recordings propose",
-        "",
-        (),
-        (tuple(changes),),
-        {},
-        tuple(parameters),
-        ((1.0,),),
-        "",
-        (),
-        "",
-    )
+    return Effect(LAW, "A law that the recordings propose", "", (tuple(changes),), tuple(parameters))
 
 
 def _parameter(label: str, unit: str | None, trial: Expr | None, null: float) -> EffectParameter:
-    return EffectParameter(label, unit, -np.inf, np.inf, null, trial, None, False, None, None)
+    return EffectParameter(label, unit, -np.inf, np.inf, null, trial)
 
 
 def readable(e: Expr) -> str:

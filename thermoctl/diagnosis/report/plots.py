@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from thermoctl.diagnosis.curves import Curve
 from thermoctl.diagnosis.report.figures import COLUMNS, WIDE, percent
 from thermoctl.report.page import BLUE, FAINT, GREY, ORANGE, THIRD, panel, panels, unit
 from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, titled
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 POINTS = 200  # number of buckets of a curve, each drawn by its smallest and its largest value
 DOTS = 300  # largest number of measured values that are drawn
@@ -58,21 +53,16 @@ def remaining(c: Curve, key: str, noise: float, caption: str) -> str:
     """Return the figure of an error in its own scale, with its autocorrelation and cumulated periodogram."""
     e = c.errors[key]
     seen = e[np.isfinite(e)]
-    drawn = [_error(c, e, noise)]
+    axes, (t, label) = panel(THIRD), _times(c)
+    axes.axhspan(-WIDE * noise, WIDE * noise, color=FAINT, lw=0, alpha=0.6)
+    axes.plot(*_thin(t, e), color=BLUE, lw=0.7)
+    titled(axes, "error, and 95 % of the noise", label, _with_unit(c.output, _difference(c.unit)))
+    drawn = [axes]
     if len(seen) >= FEWEST and float(np.ptp(seen)) > 0:
         drawn += [panel(THIRD), panel(THIRD)]
         draw_autocorrelation(drawn[1], seen)
         draw_periodogram(drawn[2], seen)
     return panels(drawn, caption)
-
-
-def _error(c: Curve, e: np.ndarray, noise: float) -> Axes:
-    axes = panel(THIRD)
-    t, label = _times(c)
-    axes.axhspan(-WIDE * noise, WIDE * noise, color=FAINT, lw=0, alpha=0.6)
-    axes.plot(*_thin(t, e), color=BLUE, lw=0.7)
-    titled(axes, "error, and 95 % of the noise", label, _with_unit(c.output, _difference(c.unit)))
-    return axes
 
 
 def _times(c: Curve) -> tuple[np.ndarray, str]:
