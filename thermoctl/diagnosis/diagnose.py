@@ -12,7 +12,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
@@ -22,7 +22,7 @@ from thermoctl.diagnosis.law.refit import law_of
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.diagnosis.search.beam import Keys, Searched, Weighed, search
+from thermoctl.diagnosis.search.beam import Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh

@@ -121,9 +121,7 @@ def changed(known: Case, tables: Sequence[Table], goal: float, budget: Budget) -
     Nothing is averaged or left out again. None if the cost of the refit stays above `goal`.
     Raises SimulationError."""
     drives = _drives(known, tables)
-    null = fit(
-        known.null.model, drives, known.noise, iterations=40, tolerance=ROUGH, seconds=np.inf, goal=goal
-    )
+    null = fit(known.null.model, drives, known.noise, tolerance=ROUGH, seconds=np.inf, goal=goal)
     if null.cost > goal:
         return None
     coordinates = Coordinates(drives)

@@ -16,7 +16,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.held_out import Worth, rms_of
 from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import PlacedLaw
 from thermoctl.diagnosis.law.result import law_entry
@@ -64,8 +64,8 @@ class Diagnosis:
     before: Left
     worth: Worth
     decision: Decision
-    energy: Mapping[frozenset[Key], Energy]
-    physics: Mapping[frozenset[Key], Mapping[Key, float]]
+    energy: Mapping[Keys, Energy]
+    physics: Mapping[Keys, Mapping[Key, float]]
     unknown: str
     asked: Mapping[Key, float]
     families: tuple[Family, ...] = ()
@@ -81,7 +81,7 @@ class Diagnosis:
         return tuple(e for e in effects if e.key in self.decision.named)
 
     @property
-    def refused(self) -> frozenset[Key]:
+    def refused(self) -> Keys:
         """Return the effects that are not named because other data do not confirm them."""
         return frozenset(self.asked) - {*self.decision.named}
 

@@ -152,7 +152,6 @@ def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
     plant, read = model.plant, direct_outputs(model.plant)
 
     def start(state: str) -> float:
-        """Return the start of one state."""
         if state in known:
             return float(known[state])
         if read.get(state) in d.first:
@@ -196,7 +195,7 @@ def case(
     rtol = _rtol(drives, noise)
     for d in drives:
         d.rtol = rtol
-    null = fit(model, drives, noise, fewer.z, iterations=40, tolerance=ROUGH, seconds=np.inf)
+    null = fit(model, drives, noise, fewer.z, tolerance=ROUGH, seconds=np.inf)
     as_stated = [
         d.y - model.run(d, values, np.zeros_like(dx0)).y
         for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)

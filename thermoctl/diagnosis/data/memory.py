@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
@@ -57,7 +57,7 @@ class Past:
     counts: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def keys(self) -> frozenset[Key]:
+    def keys(self) -> Keys:
         """Return the (effect, where) of each effect."""
         return frozenset(e.key for e in self.effects)
 
@@ -69,7 +69,7 @@ class Memory:
     hypotheses: tuple[Past, ...] = ()
     recordings: tuple[str, ...] = ()
 
-    def of(self, keys: frozenset[Key], plant: Plant) -> Past:
+    def of(self, keys: Keys, plant: Plant) -> Past:
         """Return the posterior of a hypothesis, else of the largest, then likeliest, one that it contains."""
         ranges = {n: p.range for n, p in plant.parameters.items()}
         parts = [

@@ -86,14 +86,14 @@ class Reduced:
 
 def noise_of_means(plant: Plant, drives: Sequence[Excitation], block: int) -> tuple[Noise, ...]:
     """Return the noise of each output in means of `block` rows: only the white part becomes smaller."""
-
-    def mean(n: Noise, stated: object) -> Noise:
-        """Return the noise of a mean of readings: only the white part becomes smaller."""
-        white = stated.white if isinstance(stated, SensorNoise) else n.sigma
-        return dataclasses.replace(n, sigma=float(np.sqrt(max(n.sigma**2 - white**2 * (1 - 1 / block), 0.0))))
-
-    noise = zip(default_noise(plant, drives), plant.outputs.values(), strict=True)
-    return tuple(mean(n, o.noise) if block > 1 and o.noise_sd else n for n, o in noise)
+    out = []
+    for n, o in zip(default_noise(plant, drives), plant.outputs.values(), strict=True):
+        if block > 1 and o.noise_sd:
+            white = o.noise.white if isinstance(o.noise, SensorNoise) else n.sigma
+            mean = np.sqrt(max(n.sigma**2 - white**2 * (1 - 1 / block), 0.0))
+            n = dataclasses.replace(n, sigma=float(mean))
+        out.append(n)
+    return tuple(out)
 
 
 def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:

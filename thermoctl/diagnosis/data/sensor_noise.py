@@ -62,7 +62,7 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
             f"{', '.join(t.path for t in tables)}: too little data: at most {most} measured values of one output; "
             f"{LEAST} or more are needed to learn its noise"
         )
-    refitted = fit(model, drives, default_noise(plant, drives), iterations=40, tolerance=1e-3, seconds=np.inf)
+    refitted = fit(model, drives, default_noise(plant, drives), tolerance=1e-3, seconds=np.inf)
     rows = [transform(c, refitted.residuals[c.recording][:, c.output]) for c in channels]
     powers = [_Powers(c, p) for c, p in zip(channels, coordinates.powers(rows), strict=True)]
     outputs = dict(plant.outputs)

@@ -28,7 +28,7 @@ from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
 from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
 from thermoctl.diagnosis.evidence.starts import beside_parent, first_point
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Keys
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.climb import Climbed
@@ -66,7 +66,7 @@ class Fitted:
     rough_powers: tuple[np.ndarray, ...]
     curvature: np.ndarray  # H of the unknowns that all recordings share, the others eliminated
     past: Past  # posterior of earlier recordings
-    before: tuple[frozenset[Key], float] | None  # effects and log likelihood of the hypothesis it extends
+    before: tuple[Keys, float] | None  # effects and log likelihood of the hypothesis it extends
 
     @property
     def absent(self) -> bool:

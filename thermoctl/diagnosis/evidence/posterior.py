@@ -17,7 +17,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.coordinates import Channel, rows_of_each, transform
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
-from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, Keys
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.climb import Climbed, Spot, climb
@@ -56,7 +56,7 @@ class Hypothesis:
     effects: tuple[Placed, ...] = ()
 
     @property
-    def keys(self) -> frozenset[Key]:
+    def keys(self) -> Keys:
         """The key (effect, place) of each effect."""
         return frozenset(e.key for e in self.effects)
 

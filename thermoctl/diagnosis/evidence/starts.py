@@ -6,7 +6,7 @@ import numpy as np
 
 from thermoctl.diagnosis.evidence.onsets import TIMES
 from thermoctl.diagnosis.evidence.posterior import Posterior
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Keys
 from thermoctl.plant.fitting.climb import bounded_step
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.fitting.residuals import Evaluation, Problem
@@ -89,7 +89,7 @@ def _along_values(posterior: Posterior, z: np.ndarray, now: Evaluation, free: np
     return out
 
 
-def beside_parent(posterior: Posterior, parent: frozenset[Key], fit: Fit) -> np.ndarray:
+def beside_parent(posterior: Posterior, parent: Keys, fit: Fit) -> np.ndarray:
     """Return the unknowns at the maximum `fit` of a parent, with a small share of each effect that it lacks.
 
     `parent`: the keys of its effects."""

@@ -12,6 +12,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 
 Key = tuple[str, str]  # (effect, where)
+Keys = frozenset[Key]  # the effects of a hypothesis
 
 
 def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:

@@ -129,9 +129,9 @@ def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
 
 def _between(rig: Rig, place: Place, a: str, b: str) -> Signal:
     """Return the difference of two nodes as a signal."""
-    unit = _difference(rig.physics.nodes[a].unit)
+    unit = rig.physics.nodes[a].unit
     difference = ex.add(name(a), ex.neg(name(b)))
-    return Signal(f"{a} - {b}", difference, unit, drives=place.part == "flow")
+    return Signal(f"{a} - {b}", difference, "K" if unit in TEMPERATURE else unit, drives=place.part == "flow")
 
 
 def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | None:
@@ -141,10 +141,6 @@ def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | Non
     day = conversion("day", unit)[0]
     hours = np.floor(24 * np.concatenate([np.atleast_1d(run[clock]) for run in runs]) / day) % 24
     return Signal(clock, name(clock), unit, day, daily=True) if len(np.unique(hours)) == 24 else None
-
-
-def _difference(unit: str | None) -> str | None:
-    return "K" if unit in TEMPERATURE else unit
 
 
 def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:

@@ -13,7 +13,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
 from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
-from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
@@ -42,7 +42,6 @@ SPREAD = 1.15
 BEATEN = 10.0
 # Share of the hypotheses near the best that will be extended, for the time left that the progress states.
 CLOSE = 0.5
-Keys = frozenset[Key]
 
 
 @dataclass(frozen=True)

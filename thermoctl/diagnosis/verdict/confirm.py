@@ -28,8 +28,7 @@ from thermoctl.diagnosis.data.coordinates import FEWEST
 from thermoctl.diagnosis.evidence.fit import UNIFORM, Fitted, as_refitted
 from thermoctl.diagnosis.evidence.held_out import errors_aside
 from thermoctl.diagnosis.evidence.posterior import Posterior, gaussian
-from thermoctl.diagnosis.hypothesis.candidates import Key
-from thermoctl.diagnosis.search.beam import Keys
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.verdict.decide import Probabilities
 from thermoctl.plant.fitting.climb import bounded_step
 from thermoctl.plant.simulation.simulate import SimulationError

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.limits import Thresholds
 
 
@@ -20,7 +20,7 @@ class Probabilities:
 
     `something`: probability that at least one effect or law is there"""
 
-    hypotheses: Mapping[frozenset[Key], float]
+    hypotheses: Mapping[Keys, float]
     effects: Mapping[Key, float]
     something: float
 
@@ -60,9 +60,7 @@ class Decision:
 
 
 def weigh(
-    scores: Mapping[frozenset[Key], float],
-    physics: Mapping[frozenset[Key], Mapping[Key, float]],
-    divisor: float = 1.0,
+    scores: Mapping[Keys, float], physics: Mapping[Keys, Mapping[Key, float]], divisor: float = 1.0
 ) -> Probabilities:
     """Return the posterior of hypotheses, the likeliest first, and of each effect.
 

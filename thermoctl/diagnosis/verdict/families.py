@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.verdict.decide import Probabilities
 
@@ -25,7 +25,7 @@ class Family:
 
 def families(
     posterior: Probabilities,
-    physics: Mapping[frozenset[Key], Mapping[Key, float]],
+    physics: Mapping[Keys, Mapping[Key, float]],
     named: Sequence[Key],
     entries: Mapping[str, Effect],
     asked: Mapping[Key, float],

@@ -94,7 +94,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     out = {}
     for where, response, size in _ways(metric.model.plant, responses, metric.signals):
         x = metric.project(size * response) * counts[:, None]
-        scores = [evidence(metric, x * share, weight)[0] for share in SHARES]
+        scores = [evidence(metric, x * share, weight) for share in SHARES]
         gain = float(logsumexp(scores) - np.log(len(SHARES)))
         if np.isfinite(gain):
             out[where] = gain
@@ -118,11 +118,11 @@ def _ways(
                 yield f.name, responses[f.target] - responses[f.source], size
 
 
-def evidence(metric: Metric, x: np.ndarray, weight: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method, and w.
+def evidence(metric: Metric, x: np.ndarray, weight: np.ndarray) -> float:
+    """Return the log evidence of flows with whitened responses x (rows, knots) by Laplace's method.
 
     `weight` (rows,): of the noise without them; it rises where they explain part of that noise."""
-    score, w = 0.0, np.zeros(x.shape[1])  # those of no flow
+    score = 0.0  # that of no flow
     for _ in range(ROUNDS):
         inside = x * weight[:, None]
         curvature = np.eye(x.shape[1]) + inside.T @ inside
@@ -131,4 +131,4 @@ def evidence(metric: Metric, x: np.ndarray, weight: np.ndarray) -> tuple[float, 
         before, score = score, likelihood - 0.5 * float(w @ w + np.linalg.slogdet(curvature)[1])
         if abs(score - before) < SETTLED or score < -FAR:
             break
-    return score, w
+    return score
