@@ -132,7 +132,7 @@ def bic(job: Job) -> dict[str, Any]:
     for _ in range(MOST):
         looked = screened(known, current)
         first: dict[tuple[str, str], Direction] = {}
-        for d in sorted(looked.directions, key=lambda d: d.log_p):
+        for d in sorted((d for d, _ in looked.promised), key=lambda d: d.log_p):
             first.setdefault(d.candidate.key, sharpened(looked.metric, looked.rig, d))
         best, margin = None, 0.0
         now, samples = white(current)

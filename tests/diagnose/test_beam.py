@@ -102,7 +102,7 @@ def test_a_rival_at_the_place_of_the_leading_effect_is_refitted_though_it_promis
     s = Known({})
     vars(s.case.budget).update(fits_done=0, planned=0, untried=0)
     s.best.fitted.log_likelihood = 0.0
-    found = beam.extensions(s, s.best, SimpleNamespace(directions=[], promises=[]))
+    found = beam.extensions(s, s.best, SimpleNamespace(promised=[]))
     assert (("lag", where) in {k for w in found for k in w.fitted.hypothesis.keys}) == (where == "here")
 
 
@@ -122,7 +122,7 @@ def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, prom
     monkeypatch.setattr(shortlist, "relabels", lambda candidate: False)
     promised = {("drift", "here"): 50.0, ("radiation", "here"): promise, ("radiation", "there"): 27.0}
     directions = [SimpleNamespace(candidate=SimpleNamespace(key=k)) for k in promised]
-    looked = SimpleNamespace(directions=directions, promises=[*promised.values()])
+    looked = SimpleNamespace(promised=[*zip(directions, promised.values(), strict=True)])
     found = shortlist.elsewhere({("radiation", "there")}, 60.0, looked, [])
     assert [(d.candidate.key, gain) for (d,), gain in found] == [(("radiation", "here"), 60.0)] * tried
     assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked, [])

@@ -25,8 +25,7 @@ def looked_at(plant: str, table: Table) -> tuple[Search, Screened]:
 
 def promise(looked: Screened, effect: str, where: str) -> float:
     """The predicted gain in log likelihood of an effect at a place; 0 where it promises none."""
-    pairs = zip(looked.directions, looked.promises, strict=True)
-    return max((p for d, p in pairs if d.candidate.key == (effect, where)), default=0.0)
+    return max((p for d, p in looked.promised if d.candidate.key == (effect, where)), default=0.0)
 
 
 def test_a_remainder_does_not_hide_a_slow_effect_from_the_screening():

@@ -31,9 +31,7 @@ def test_its_refit_starts_where_it_gains_what_the_screening_promised(seed):
     null = started(known, limits()).best
     looked = screened(known, null.fitted)
     key = ("second_ambient", "one")
-    promise, found = next(
-        (p, d) for d, p in zip(looked.directions, looked.promises, strict=True) if d.candidate.key == key
-    )
+    promise, found = next((p, d) for d, p in looked.promised if d.candidate.key == key)
     assert found.start["G"] > 0
     assert all(abs(found.start[f"B{k}"] - 21.0) < 30 for k in range(5))
     refits = followed(known, null.fitted, looked, (found,), null.fitted)

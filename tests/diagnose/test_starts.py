@@ -65,7 +65,7 @@ def test_a_slow_sensor_pays_no_more_for_its_start_than_a_delayed_one():
     known = case(loads(TWO_BLOCKS), tables, catalogue(), Budget(80))
     null = started(known, limits()).best.fitted
     looked, paid = screened(known, null), {}
-    for d in looked.directions:
+    for d, _ in looked.promised:
         if d.candidate.key in (("sensor_lag", "temperature_1"), ("sensor_delay", "temperature_1")):
             best = max(followed(known, null, looked, (d,), null), key=lambda f: f.log_evidence)
             paid[d.candidate.key[0]] = best.log_likelihood - best.log_evidence

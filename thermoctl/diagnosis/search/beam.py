@@ -122,7 +122,7 @@ class Search:
         looked = screened(self.case, parent.fitted, self.known)
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
-        for d, gain in zip(looked.directions, looked.promises, strict=True):
+        for d, gain in looked.promised:
             self.promised[d.candidate.key] = max(gain, self.promised.get(d.candidate.key, 0.0))
         found = extensions(self, parent, looked)
         self.keep(found)

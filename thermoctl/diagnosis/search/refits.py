@@ -46,7 +46,7 @@ def followed(
     If every refit fits worse than the parent, start again from a weaker effect."""
     stuck = tuple(sticking(d) or d for d in first)
     found = [_refitted(case, parent, first, looked, leader)]
-    if stuck != first and max(d.gain for d in first) > looked.directions[0].gain / PAIR:
+    if stuck != first and max(d.gain for d in first) > looked.promised[0][0].gain / PAIR:
         found.append(_refitted(case, parent, stuck, looked, leader))
     if all(f is None or f.rough.cost > parent.rough.cost for f in found):
         found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))

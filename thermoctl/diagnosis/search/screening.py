@@ -27,7 +27,7 @@ ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
 
 @dataclass(frozen=True)
 class Screened:
-    """The catalogue's best directions; `promises`: predicted gain in log likelihood of each.
+    """The catalogue's best directions, each `promised` with its predicted gain in log likelihood.
 
     `every`: the best direction of each candidate, with its vector. `energy`: the rows whitened by the
     sensors' noise alone; `by_energy`: all directions, sorted by their gain there. Where the plant has a large
@@ -37,8 +37,7 @@ class Screened:
 
     metric: Metric
     rig: Rig
-    directions: list[Direction]
-    promises: list[float]
+    promised: list[tuple[Direction, float]]
     every: list[Direction]
     energy: Metric | None
     by_energy: list[Direction]
@@ -92,9 +91,7 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     promised += [(d, 0.5 * d.gain - float(np.log(10)) * d.elsewhere) for d in picked]
     promised.sort(key=lambda x: -x[1])
     energy, by_energy = (other, by_energy) if loud else (None, [])
-    return Screened(
-        metric, rig, [d for d, _ in promised], [p for _, p in promised], best, energy, by_energy, norms
-    )
+    return Screened(metric, rig, promised, best, energy, by_energy, norms)
 
 
 def places(case: Case) -> dict[str, set[str]]:

@@ -57,7 +57,7 @@ def simpler(
 
     The entry that an effect contains may gain as much as this one, others what they promise themselves."""
     out: list[Extension] = []
-    for d, promise in zip(looked.directions, looked.promises, strict=True):
+    for d, promise in looked.promised:
         here = [a.candidate.effect for a in added if a.candidate.place.where == d.candidate.place.where]
         if d.gain > 0 and any(d.candidate.effect.name == a.contains for a in here):
             out.append(((d,), gain))
@@ -82,7 +82,7 @@ def shortlist(
     energy, then pairs. The gain of a proposal by energy is infinite. At most PLACES_EACH places of an effect
     are listed alone. `paired`: with pairs that are not proposed by energy?"""
     worthwhile = []
-    for d, promise in zip(looked.directions, looked.promises, strict=True):
+    for d, promise in looked.promised:
         gain = predicted(d, promise, where, limits)
         if gain > 0 and d.gain > 0 and not relabels(d.candidate):
             worthwhile.append((d, gain))
@@ -111,9 +111,8 @@ def elsewhere(
         return []
     ((name, where),) = leading
     listed = {d.candidate.key for added, _ in queue for d in added} | {(name, where)}
-    promised = [*zip(looked.directions, looked.promises, strict=True)]
-    least = max((p for d, p in promised if d.candidate.key == (name, where)), default=np.inf)
-    others = [d for d, p in promised if d.candidate.key[0] == name and p >= least]
+    least = max((p for d, p in looked.promised if d.candidate.key == (name, where)), default=np.inf)
+    others = [d for d, p in looked.promised if d.candidate.key[0] == name and p >= least]
     return [((d,), gain) for d in others if d.candidate.key not in listed and not relabels(d.candidate)]
 
 
