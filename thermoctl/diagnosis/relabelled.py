@@ -29,6 +29,7 @@ from thermoctl.diagnosis.data.case import ROUGH, Budget, Case, grids_of
 from thermoctl.diagnosis.data.coordinates import Coordinates
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
+from thermoctl.diagnosis.hypothesis.candidates import spoken
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
@@ -86,7 +87,7 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     stays = _misfit(known, present.fitted, limits)
     if stays and _misfit(again, leader.fitted, limits) >= HALF * stays:
         return None
-    effects = ", ".join(f"{e} at {w}" for e, w in sorted(leader.fitted.hypothesis.keys))
+    effects = ", ".join(spoken(leader.fitted.hypothesis.keys))
     present_effects = ", ".join(f"{e.key[0]} at {e.key[1]}" for e in found.best.hypothesis.effects)
     a, b = h.columns
     return Finding(

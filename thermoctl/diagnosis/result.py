@@ -16,7 +16,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.held_out import Worth, rms_of
 from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
-from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, spoken
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import PlacedLaw
 from thermoctl.diagnosis.law.result import law_entry
@@ -175,10 +175,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "decision": {"row": d.decision.row, **d.decision.numbers},
             "hypotheses": _hypotheses(d),
             "lost": _lost(d),
-            "refused": [
-                {"effects": [f"{e} at {at}" for e, at in sorted(keys)], "reason": why}
-                for keys, why in d.searched.refused.items()
-            ],
+            "refused": [{"effects": spoken(keys), "reason": why} for keys, why in d.searched.refused.items()],
             "promised": {f"{e} at {at}": gain for (e, at), gain in sorted(d.searched.promised.items())},
             "not_seen": [],
             "truncated": d.searched.truncated,
@@ -215,7 +212,7 @@ def _notes(d: Diagnosis) -> list[str]:
 def unfinished(*fits: Fitted) -> list[str]:
     """Return a sentence for each fit that the limit of steps ended below its maximum."""
     names = {
-        ", ".join(f"{e} at {at}" for e, at in sorted(f.hypothesis.keys)) or "the plant without effects": f.fit
+        ", ".join(spoken(f.hypothesis.keys)) or "the plant without effects": f.fit
         for f in fits
         if not f.fit.converged
     }
@@ -344,7 +341,7 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
         physics = d.physics.get(keys)
         out.append(
             {
-                "effects": [f"{e} at {at}" for e, at in sorted(keys)],
+                "effects": spoken(keys),
                 "log_evidence": w.fitted.log_evidence - null,
                 "log_prior_odds": w.log_odds,
                 "posterior": d.posterior.hypotheses.get(keys, 0.0),

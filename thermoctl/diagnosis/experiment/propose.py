@@ -18,7 +18,7 @@ inputs' excursions are made smaller (SHARES)."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +29,7 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, with_residuals
 from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, family, levers, recorded
 from thermoctl.diagnosis.experiment.file import FILES
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import spoken
 from thermoctl.diagnosis.law.result import described
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.files.yamlfile import InputError
@@ -167,7 +167,9 @@ def survivors(diagnosis: Diagnosis) -> list[Standing]:
             doubt = 1.0 - min(diagnosis.asked.values(), default=1.0)
             hypotheses[frozenset()] = max(hypotheses.get(frozenset(), 0.0), doubt)
         fits = {w.fitted.hypothesis.keys: w.fitted for w in diagnosis.searched.tried}
-        likely = [(fits[k], p, _effects(k)) for k, p in hypotheses.items()]
+        likely = [
+            (fits[k], p, " and ".join(spoken(k)) or "the plant as it is") for k, p in hypotheses.items()
+        ]
     elif law := diagnosis.law:
         laws = ((law.proposal, law.fitted, law.share), *law.rivals)
         likely = [(f, share, described(p, f)) for p, f, share in laws]
@@ -175,10 +177,6 @@ def survivors(diagnosis: Diagnosis) -> list[Standing]:
         return []
     likely.sort(key=lambda x: -x[1])
     return [x for x in likely if x[1] >= LIKELY * likely[0][1] and x[1] > 0][:MOST]
-
-
-def _effects(keys: Iterable[Key]) -> str:
-    return " and ".join(f"{effect} at {where}" for effect, where in sorted(keys)) or "the plant as it is"
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from thermoctl.diagnosis.hypothesis.builder import Candidate as Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
@@ -13,6 +13,11 @@ from thermoctl.plant.expression import Expr, name
 
 Key = tuple[str, str]  # (effect, where)
 Keys = frozenset[Key]  # the effects of a hypothesis
+
+
+def spoken(keys: Iterable[Key]) -> list[str]:
+    """Return `effect at place` of each effect, sorted."""
+    return [f"{effect} at {where}" for effect, where in sorted(keys)]
 
 
 def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:

@@ -38,9 +38,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
 
-def with_laws(
-    case: Case, result: Searched, limits: Thresholds, say: Callable[[str], None] = lambda text: None
-) -> Searched:
+def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[str], None]) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     No law is sought if the plant leaves only noise and no effect was found. Nor is one if a single effect

@@ -32,15 +32,11 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     Where a law fits much better than the hypothesis, a free function of a signal gains something there. At a
     velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
     off the gain. Raises SimulationError."""
-    refitted = as_refitted(case, f)
-    metric = Metric(Plain(case, f.rough), refitted.average, True)
+    metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
     linear = Tracked(metric, metric.residual, {})
     rig = case.rig(f.rough_plant, metric.drives)
     where = places(rig)
-    nodes = [p.target for p in where if p == Place(p.target)]
-    if len(nodes) > NODES:
-        nodes = located(case, refitted, reached(case))[:NODES]
-    combos = choices(rig, where, nodes, linear)
+    combos = choices(rig, where, entered(case, f, where, NODES), linear)
     moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
     both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
     products = [(p, partial(_along_both, linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
@@ -48,6 +44,12 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     gains = [gain + off for gain, *_ in ranked(linear, combos)[:1]]
     gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
     return SPREAD * max(gains, default=-np.inf) > look + unlikely(limits)
+
+
+def entered(case: Case, f: Fitted, where: Sequence[Place], most: int) -> list[str]:
+    """Return the nodes that a law may enter; of more than `most`, those that explain most."""
+    nodes = [p.target for p in where if p == Place(p.target)]
+    return nodes if len(nodes) <= most else located(case, as_refitted(case, f), reached(case))[:most]
 
 
 def choices(

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
-from thermoctl.diagnosis.evidence.unknown import located, reached
+from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.free import (
@@ -24,6 +23,7 @@ from thermoctl.diagnosis.law.free import (
     choices,
     cost_of,
     energy,
+    entered,
     log_number,
     predicted,
     ranked,
@@ -178,10 +178,7 @@ def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
     drives = case.drives(parent.rough.model)
     rig = case.rig(parent.rough_plant, drives)
     where = places(rig)
-    nodes = [p.target for p in where if p == Place(p.target)]
-    if len(nodes) > TRACKED:
-        nodes = located(case, as_refitted(case, parent), reached(case))[:TRACKED]
-    return rig, where, tracked(case, parent, nodes)
+    return rig, where, tracked(case, parent, entered(case, parent, where, TRACKED))
 
 
 def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
