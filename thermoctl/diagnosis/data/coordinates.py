@@ -70,8 +70,7 @@ def channel(d: Excitation, r: int, j: int, most: int | None = None) -> Channel |
     index = measured(d.y[:, j])
     if len(index) < FEWEST:
         return None
-    if quick(len(index)) < len(index):
-        index = index[: quick(len(index))]
+    index = index[: quick(len(index))]
     block = max(1, len(index) // (2 * most)) if most else 1
     n = len(index) // block
     rows = min(n, most or n)
@@ -137,7 +136,7 @@ def _blocks(c: Channel, e: np.ndarray) -> np.ndarray:
 
 
 class Coordinates:
-    """The rows of all outputs in all recordings."""
+    """The rows of all outputs in all recordings; channels are in the order of the recordings."""
 
     def __init__(self, drives: Sequence[Excitation], most: int | None = None):
         channels = (channel(d, r, j, most) for r, d in enumerate(drives) for j in range(d.y.shape[1]))

@@ -37,16 +37,7 @@ LEAST = 100  # least number of measured values of an output to learn its noise
 DIGITS = 3
 
 
-@dataclasses.dataclass(frozen=True)
-class _Powers:
-    """A channel, and the power of its residual in each band (bands,)."""
-
-    channel: Channel
-    power: np.ndarray
-
-    def expected(self, noise: SensorNoise, step: float) -> np.ndarray:
-        """Return the variance of a row in each band. `step`: the variance of the rounding."""
-        return step + spectrum(noise, self.channel.frequency, self.channel.interval)
+Power = tuple[Channel, np.ndarray]  # a channel, and the power of its residual in each band (bands,)
 
 
 def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
@@ -64,7 +55,7 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
         )
     refitted = fit(model, drives, default_noise(plant, drives), tolerance=1e-3, seconds=np.inf)
     rows = [transform(c, refitted.residuals[c.recording][:, c.output]) for c in channels]
-    powers = [_Powers(c, p) for c, p in zip(channels, coordinates.powers(rows), strict=True)]
+    powers = list(zip(channels, coordinates.powers(rows), strict=True))
     outputs = dict(plant.outputs)
     for j, ks in by_output.items():
         if counts[j] < LEAST:
@@ -76,12 +67,12 @@ def learnt(plant: Plant, tables: Sequence[Table]) -> Plant:
     return dataclasses.replace(plant, outputs=outputs)
 
 
-def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
+def _best(powers: Sequence[Power], step: float) -> SensorNoise:
     """Return the spectrum with the best Schwarz criterion. `step`: the variance of the rounding."""
-    rows = sum(float(p.channel.count.sum()) for p in powers)
-    total = float(np.sqrt(sum(p.power.sum() for p in powers) / rows))
-    longest = max(p.channel.interval * p.channel.rows for p in powers)
-    shortest = min(p.channel.interval for p in powers)
+    rows = sum(float(c.count.sum()) for c, _ in powers)
+    total = float(np.sqrt(sum(p.sum() for _, p in powers) / rows))
+    longest = max(c.interval * c.rows for c, _ in powers)
+    shortest = min(c.interval for c, _ in powers)
     starts = {
         "white": [[0.0]],
         "drift": [[-0.3, -1.0, np.log(tau)] for tau in np.geomspace(3 * shortest, longest / 3, 4)],
@@ -96,7 +87,7 @@ def _best(powers: Sequence[_Powers], step: float) -> SensorNoise:
             tried.append((done.fun + 0.5 * len(start) * np.log(rows) + (0 if inside else np.inf), noise))
     best = min(tried, key=lambda x: x[0])[1]
     # by channel, the rms of the residual over that of the noise
-    ratios = (np.sum(p.power / p.expected(best, step)) / p.channel.count.sum() for p in powers)
+    ratios = (np.sum(p / _expected(c, best, step)) / c.count.sum() for c, p in powers)
     scale = np.sqrt([*ratios])
     spread = float(np.var(np.log(scale)) if len(scale) > 1 else 0.0)
     # Of the logarithm: the variance of one estimate, and that from recording to recording.
@@ -111,12 +102,17 @@ def _made(kind: str, x: np.ndarray, total: float) -> SensorNoise:
     return SensorNoise(size[0], flicker=size[1]) if kind == "flicker" else SensorNoise(size[0])
 
 
-def _cost(x: np.ndarray, kind: str, powers: Sequence[_Powers], total: float, step: float) -> float:
+def _expected(c: Channel, noise: SensorNoise, step: float) -> np.ndarray:
+    """Return the variance of a row in each band. `step`: the variance of the rounding."""
+    return step + spectrum(noise, c.frequency, c.interval)
+
+
+def _cost(x: np.ndarray, kind: str, powers: Sequence[Power], total: float, step: float) -> float:
     """Minus the log likelihood, up to a constant."""
     noise, cost = _made(kind, np.clip(x, -20.0, 20.0), total), 0.0
-    for p in powers:
-        v = p.expected(noise, step) + 1e-12 * total**2
-        cost += 0.5 * float(np.sum(p.channel.count * np.log(v) + p.power / v))
+    for c, p in powers:
+        v = _expected(c, noise, step) + 1e-12 * total**2
+        cost += 0.5 * float(np.sum(c.count * np.log(v) + p / v))
     return cost
 
 

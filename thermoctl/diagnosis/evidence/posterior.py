@@ -206,9 +206,8 @@ class Posterior:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds (k,) of the unknowns."""
         n, m = self.problem.n_parameters, len(self.problem.unknowns)
-        return np.concatenate([np.zeros(n), np.full(m - n, -FAR)]), np.concatenate(
-            [np.ones(n), np.full(m - n, FAR)]
-        )
+        starts = np.arange(m) >= n
+        return np.where(starts, -FAR, 0.0), np.where(starts, FAR, 1.0)
 
     def prior(self, z: np.ndarray) -> float:
         """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.

@@ -94,7 +94,7 @@ def responses(
         for n in model.plant.nodes
         if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
     )
-    white: dict[int, np.ndarray] = {}
+    white: list[np.ndarray] = []
     trajectories = [
         signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
     ]
@@ -105,18 +105,15 @@ def responses(
         q = [force * s / storage[:, None] for s, storage in zip(size, storages, strict=True)]
         at = [(model.states.index(n), i * FORCES + k) for i, n in enumerate(nodes) for k in range(FORCES)]
         dy = model.respond(d, values[r], dx0[r], at, np.concatenate(q, axis=1), len(at)) if at else None
-        for k, c in enumerate(coordinates.channels):
-            if c.recording != r:
-                continue
-            white[k] = np.zeros((len(nodes), len(c.count)))
+        for c in coordinates.of_recording(r):
+            power = np.zeros((len(nodes), len(c.count)))
             if dy is not None:
                 rows = transform(c, dy[:, c.output]) ** 2
                 mean = np.stack([np.bincount(c.band, column) for column in rows.T]) / c.count
-                white[k] = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
+                power = mean.reshape(len(nodes), FORCES, -1).sum(axis=1)
+            white.append(power)
     span = max(float(d.t[-1] - d.t[0]) for d in drives)
     intervals = [float(np.median(np.diff(d.t))) for d in drives]
     taus = np.geomspace(span / 40, span / 4, CORNERS)
     share, corner = np.meshgrid(SHARES, taus, indexing="ij")
-    return Responses(
-        nodes, [white[k] for k in range(len(coordinates.channels))], share.ravel(), corner.ravel(), intervals
-    )
+    return Responses(nodes, white, share.ravel(), corner.ravel(), intervals)
