@@ -179,7 +179,6 @@ def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float,
         run = model.run(excitation.part(0, 2), sensitivities=True)
     except SimulationError:
         return {}
-    assert run.dy is not None
     spread = [np.ptp(p.range) / 12**0.5 if (p := plant.parameters[q]).range else 0.0 for q in model.active]
     spread += [plant.nodes[n].initial_sigma or 0.0 for n in model.uncertain]
     errors = {}
@@ -187,7 +186,7 @@ def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float,
     for j, (o, noise) in enumerate(zip(plant.outputs.values(), noises, strict=True)):
         if ex.names(o.value) & set(model.states) and np.isfinite(excitation.y[0, j]):
             error = float(excitation.y[0, j] - run.y[0, j])
-            sd = float(np.hypot(noise.sigma, np.linalg.norm(run.dy[0, j] * spread)))
+            sd = float(np.hypot(noise.sigma, np.linalg.norm(run.sensitivities[0, j] * spread)))
             errors[o.name] = error, abs(error) / sd
     return errors
 

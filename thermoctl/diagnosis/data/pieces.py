@@ -68,8 +68,7 @@ def _growth(model: Model, d: Excitation, sigma: np.ndarray) -> np.ndarray:
         run = model.run(model.prepare(d), None, None, sensitivities=True, states=False)
     except SimulationError:
         return np.zeros(0)
-    assert run.dy is not None
     start = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
-    change = np.abs(run.dy[:, :, len(model.active) :]) * start / sigma[:, None]
+    change = np.abs(run.sensitivities[:, :, len(model.active) :]) * start / sigma[:, None]
     growth = np.maximum.accumulate(change.reshape(len(change), -1).max(axis=1))
     return np.asarray(growth / max(growth[0], 1e-300))

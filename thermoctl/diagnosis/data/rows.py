@@ -137,8 +137,7 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
 
     def columns(j: int) -> np.ndarray:
         """Return the whitened slopes (N, k + 1) of an output's readings by the unknowns and by its delay."""
-        assert run.dy is not None
-        by = np.column_stack([run.dy[:, j, used] * slope, np.gradient(run.y[:, j], d.t)])
+        by = np.column_stack([run.sensitivities[:, j, used] * slope, np.gradient(run.y[:, j], d.t)])
         return np.where(np.isfinite(d.y[:, j, None]), by / problem.noise[j].sigma, 0.0)
 
     whole = _information(columns, d, np.arange(len(d.t)), 1, prior)

@@ -132,8 +132,7 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     def slopes(z: np.ndarray) -> np.ndarray:
         """Return their derivatives (rows, starts)."""
         run = model.run(d, None, z * prior, sensitivities=True)
-        assert run.dy is not None
-        start = run.dy[:, :, len(model.active) :][good] * prior
+        start = run.sensitivities[:, :, len(model.active) :][good] * prior
         return np.concatenate([-start / scale[:, None], np.eye(len(z))])
 
     try:

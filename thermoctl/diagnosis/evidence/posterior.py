@@ -97,8 +97,7 @@ def _slopes(
     d, buffers = problem.excitations[r], problem.buffers
     run = problem.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
     used, unknowns, slope = problem.slopes(r, values)
-    assert run.dy is not None
-    return d.y - run.y, unknowns, [_slope_rows(c, run.dy, used, slope) for c in channels]
+    return d.y - run.y, unknowns, [_slope_rows(c, run.sensitivities, used, slope) for c in channels]
 
 
 def _slope_rows(c: Channel, dy: np.ndarray, used: np.ndarray, slope: np.ndarray) -> np.ndarray:
@@ -146,8 +145,7 @@ def _simulated_sums(
     """Return a recording's sums. Its slopes are computed and not kept."""
     run = problem.model.run(problem.excitations[r], values, dx0, sensitivities=True, states=False)
     used, unknowns, slope = problem.slopes(r, values)
-    assert run.dy is not None
-    dy = run.dy  # copied one channel at a time: a recording has megabytes
+    dy = run.sensitivities  # copied one channel at a time: a recording has megabytes
     slopes = (_slope_rows(c, dy, used, slope) for c in channels)
     return _sums(channels, unknowns, slopes, rows, inverse, True)
 
@@ -162,6 +160,9 @@ class Posterior:
         for d in self.drives:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
+        self.few = self.problem.few
+        starts = np.arange(len(self.problem.unknowns)) >= self.problem.n_parameters
+        self.bounds = np.where(starts, -FAR, 0.0), np.where(starts, FAR, 1.0)
         self.sizes, self.mean, precision = _priors(case, self.problem, effects)
         self.past = case.memory.of(frozenset(e.key for e in effects), plant)
         place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}
@@ -201,13 +202,6 @@ class Posterior:
         if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
             raise SimulationError("the simulation gives values that are not numbers")
         return errors
-
-    @property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds (k,) of the unknowns."""
-        n, m = self.problem.n_parameters, len(self.problem.unknowns)
-        starts = np.arange(m) >= n
-        return np.where(starts, -FAR, 0.0), np.where(starts, FAR, 1.0)
 
     def prior(self, z: np.ndarray) -> float:
         """Return the log prior of the unknowns `z`, without the Gaussians' normalisation.
@@ -283,11 +277,6 @@ class Posterior:
                 begin += len(x)
             out += pull.T @ unsure @ pull
         return out
-
-    @property
-    def few(self) -> bool:
-        """Are there so few unknowns that a trial step should compute slopes at once?"""
-        return self.problem.few
 
     def look(self, z: np.ndarray, slopes: bool) -> Spot[Seen]:
         """Return the point z with its log posterior, and with slopes if asked for."""

@@ -73,8 +73,7 @@ class _Predictor:
             run = self.model.run(self.model.excitation(table), sensitivities=True, rtol=1e-5, states=states)
         except (SimulationError, InputError):
             return None
-        assert run.dy is not None
-        y, slopes = run.y, run.dy
+        y, slopes = run.y, run.sensitivities
         if states and run.dx is not None:
             y, slopes = np.concatenate([y, run.x], axis=1), np.concatenate([slopes, run.dx], axis=1)
         slopes = slopes * self.slopes @ self.root

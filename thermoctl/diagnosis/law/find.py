@@ -26,7 +26,7 @@ from thermoctl.diagnosis.law.smooth import Tracked, law_unit, tracked
 from thermoctl.diagnosis.search.beam import SPREAD
 from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
-from thermoctl.plant.fitting.cores import LEAST, batches, each
+from thermoctl.plant.fitting.cores import batches, each
 from thermoctl.plant.language import Plant
 
 SURE = 3  # number of refits of a case that tell how far its promises are right
@@ -152,7 +152,7 @@ def refits(
 
     for batch, rest in batches(queue, wanted):
         say(f"looking for a law: refit {len(queue) - rest} of {len(queue)} at most")
-        fits = each(partial(refitted_law, case, parent, leader=leader), batch, LEAST * len(batch))
+        fits = each(partial(refitted_law, case, parent, leader=leader), batch)
         for p, f in zip(batch, fits, strict=True):
             if f is None:
                 continue

@@ -98,9 +98,8 @@ def _sensitive(
     """Return a recording's run, and the DCT rows of its residual and of its sensitivities (rows, k)."""
     d = problem.excitations[r]
     run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
-    assert run.dy is not None
     used, _, slope = problem.slopes(r, values)
-    rows = transforms(channels, run.dy[:, :, used]) * slope
+    rows = transforms(channels, run.sensitivities[:, :, used]) * slope
     return Simulation(run.t, run.x, run.y), transforms(channels, d.y - run.y), rows
 
 

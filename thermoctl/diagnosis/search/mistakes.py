@@ -18,7 +18,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed, Posterior, fitted
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.files.shipped import shipped
-from thermoctl.plant.fitting.cores import LEAST, each
+from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
@@ -52,8 +52,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
             return None
 
     tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
-    refits = each(refitted, tried, LEAST * len(tried))
-    return [f for f in refits if f is not None and not f.absent]
+    return [f for f in each(refitted, tried) if f is not None and not f.absent]
 
 
 def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:

@@ -19,7 +19,7 @@ from thermoctl.diagnosis.search.screening import Screened
 from thermoctl.diagnosis.search.shortlist import PAIR, Extension
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
-from thermoctl.plant.fitting.cores import LEAST, each
+from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
@@ -35,7 +35,7 @@ def refitted(
 ) -> list[list[Fitted]]:
     """Refit a batch of extensions in parallel; return the refits of each."""
     starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
-    return each(lambda first: followed(case, parent, looked, first, leader), starts, len(batch) * LEAST)
+    return each(lambda first: followed(case, parent, looked, first, leader), starts)
 
 
 def followed(

@@ -29,7 +29,7 @@ from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values
 from thermoctl.diagnosis.search.metric import Metric, Pushed
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.diagnosis.search.shapes import shape_grid
-from thermoctl.plant.fitting.cores import ABREAST, LEAST, each
+from thermoctl.plant.fitting.cores import ABREAST, each
 
 EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
 CHUNK = 96
@@ -44,9 +44,7 @@ def directions(
     """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
     left = iter(columns)
     while parts := [p for _ in range(ABREAST) if (p := list(itertools.islice(left, CHUNK)))]:
-        rows = each(
-            lambda p: metric.responses(partial(_pushed, p, trajectories), len(p)), parts, LEAST * len(parts)
-        )
+        rows = each(lambda p: metric.responses(partial(_pushed, p, trajectories), len(p)), parts)
         yield from zip(parts, rows, strict=True)
 
 

@@ -45,7 +45,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def each(f: Callable[[T], R], items: Sequence[T], numbers: int) -> list[R]:
+def each(f: Callable[[T], R], items: Sequence[T], numbers: int = LEAST) -> list[R]:
     """Return f of each item, side by side if `numbers`, the count that all of them compute, is large.
 
     Inside f a call of `each` takes one item after the other. The first item's exception is raised."""

@@ -268,8 +268,7 @@ class Problem:
         """Return recording r's unknowns (k,), its outputs (N, ny) and their slopes (N, ny, k)."""
         run = self.model.run(self.excitations[r], values, dx0, sensitivities=True, states=False)
         used, k, slope = self.slopes(r, values)
-        assert run.dy is not None
-        return k, run.y, run.dy[:, :, used] * slope
+        return k, run.y, run.sensitivities[:, :, used] * slope
 
     def errors(self, r: int, values: np.ndarray, dx0: np.ndarray) -> np.ndarray:
         """Return recording r's free-run errors (N, ny), NaN where nothing was measured."""

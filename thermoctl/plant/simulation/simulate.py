@@ -72,6 +72,12 @@ class Simulation:
     dy: np.ndarray | None = None
     steps: int = 0
 
+    @property
+    def sensitivities(self) -> np.ndarray:
+        """Return `dy` of a run that computed it."""
+        assert self.dy is not None
+        return self.dy
+
 
 class _Forces(ctypes.Structure):
     _fields_ = [
