@@ -184,6 +184,40 @@ def test_parameters_that_scale_together_absorb_no_flow():
     assert share["broth"] > 0.5 > share["substrate"]
 
 
+BUDWORM = """\
+format: thermoctl-plant/1
+title: A population with logistic growth
+inputs:
+  moths: {}
+parameters:
+  r: {value: 0.45, range: [0.1, 1.5]}
+  K: {value: 11.0, range: [5, 30]}
+nodes:
+  N: {storage: 1, initial: first(density), initial_sigma: 0.06}
+flows:
+  growth: {into: N, rate: r * N * (1 - N / K)}
+  immigration: {into: N, rate: moths}
+outputs:
+  density: {value: N, noise: 0.06}
+"""
+
+
+def test_a_plant_that_leaves_its_bounds_is_tracked_with_shorter_steps():
+    """A whole step made the population negative: it ran away, and laws were proposed about the bad refit."""
+    plant, t = loads(BUDWORM), np.arange(0, 40, 0.25)
+    birds = Flow("birds", ex.parse("1.6 * N**2 / (1.44 + N**2)"), "N", None)
+    truth = compile_plant(replace(plant, flows={**plant.flows, "birds": birds}))
+    moths = 0.4 + 0.3 * np.sign(np.sin(t / 4))
+    starts = ({"density": np.full(len(t), n)} for n in (0.5, 3.2, 11.0))
+    tables = [truth.measure(Table(f"run_{k}", "", t, {"moths": moths, **s}), k) for k, s in enumerate(starts)]
+    known = case(plant, tables, {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    assert null.rough.rms()["density"] > 1.0  # the population must not be near its recordings
+    metric = tracked(known, null, ["N"]).metric
+    errors = [d.y - run.y for d, run in zip(metric.drives, metric.runs, strict=True)]
+    assert np.sqrt(np.mean(np.square(errors))) < 0.06
+
+
 def test_the_response_to_a_law_is_that_of_the_plant_with_it_however_fast_it_moves():
     """Hat functions, 400 over a recording, did not resolve a stage that vibrates: a motor with two gains was drag."""
     plant, t = loads(SPRING_STAGE), np.arange(0, 20, 0.0005)

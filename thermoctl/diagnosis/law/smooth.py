@@ -40,7 +40,10 @@ KNOTS = 240  # number of knots of a recording, shared among the nodes, if there 
 MANY = 4
 FEWEST_KNOTS = 24
 ABSORBED = 1e-3  # a flow is absorbed if the projection leaves less than this share of its response's norm
-STEPS = 6  # largest number of Gauss-Newton steps of the tracking
+STEPS = 24  # largest number of Gauss-Newton steps of the tracking, whole or shortened
+# Factor on a step that cannot be simulated or follows worse, and the least share of a step that is tried.
+SHORTER, SHORTEST = 0.25, 0.01
+SETTLED = 0.02  # the tracking ends where another step promises less than this share of what is left
 TOGETHER = 48  # number of responses that are simulated at a time
 
 
@@ -178,6 +181,7 @@ def _scaling(plant: Plant, node: str) -> ex.Expr:
 class _Followed:
     """The plant linearised about the trajectory that follows the recordings best.
 
+    - `metric`: whitened rows at the trajectory, and the projection
     - `misfit`: by recording, whitened rows of y - y(u^) + D u^
     - `wide`: by recording, rows of the responses to each knot's flow (rows, nodes * knots)"""
 
@@ -186,55 +190,111 @@ class _Followed:
     wide: list[np.ndarray]
 
 
-def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
-    """Follow the recordings with unknown flows into nodes. Raises SimulationError.
+@dataclass(frozen=True)
+class _Spot:
+    """Where the tracking looks: flows at the knots by recording (knots, nodes), and all unknowns z."""
 
-    Knots act in their own recording only, so that each recording is solved alone."""
-    if not nodes:
-        raise SimulationError("the plant has no node that an unknown flow could enter")
-    f = as_refitted(case, f)
-    # the refit of a plant that grows without bounds takes all of a reading for noise
-    most = [g.variance * float(np.exp(2 * g.known)) for g in case.grids]
-    noise = [min(v, m) for v, m in zip(f.average.sensor, most, strict=True)]
-    average = dataclasses.replace(f.average, sensor=noise)
-    plant = with_latent(f.rough_plant, nodes)
-    model = compile_plant(plant)
-    knots = max(FEWEST_KNOTS, KNOTS * MANY // max(len(case.tables), MANY) // len(nodes))
-    hats = [hat_functions(t.t - t.t[0], knots) for t in case.tables]
-    weights = [np.zeros((knots, len(nodes))) for _ in hats]
-    z, sizes = f.rough.z, list[float]()
-    best: tuple[float, _Followed] | None = None
-    for _ in range(STEPS + 1):
+    flows: list[np.ndarray]
+    z: np.ndarray
+
+    def towards(self, aim: _Spot, share: float) -> _Spot:
+        """Return the spot that is a share of the way to another one."""
+        flows = [u + share * (v - u) for u, v in zip(self.flows, aim.flows, strict=True)]
+        return _Spot(flows, self.z + share * (aim.z - self.z))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The plant at a spot: its rows, the whitened residuals by recording, and their sum of squares."""
+
+    plain: Plain
+    metric: Metric
+    residual: list[np.ndarray]
+    size: float
+
+
+class _Tracking:
+    """A fitted hypothesis with unknown flows into nodes, which are to follow the recordings."""
+
+    def __init__(self, case: Case, f: Fitted, nodes: Sequence[str]):
+        self.case, self.f, self.nodes = case, as_refitted(case, f), nodes
+        # the refit of a plant that grows without bounds takes all of a reading for noise
+        most = [g.variance * float(np.exp(2 * g.known)) for g in case.grids]
+        noise = [min(v, m) for v, m in zip(self.f.average.sensor, most, strict=True)]
+        self.average = dataclasses.replace(self.f.average, sensor=noise)
+        self.plant = with_latent(self.f.rough_plant, nodes)
+        self.model = compile_plant(self.plant)
+        self.knots = max(FEWEST_KNOTS, KNOTS * MANY // max(len(case.tables), MANY) // len(nodes))
+        self.hats = [hat_functions(t.t - t.t[0], self.knots) for t in case.tables]
+        self.sizes: list[float] = []
+
+    @property
+    def first(self) -> _Spot:
+        """Return the spot without unknown flows."""
+        return _Spot([np.zeros((self.knots, len(self.nodes))) for _ in self.hats], self.f.rough.z)
+
+    def look(self, at: _Spot) -> _Seen | None:
+        """Return the plant at a spot; None where it cannot be simulated there."""
         tables = tuple(
             dataclasses.replace(
-                t, columns={**t.columns, **{f"{LATENT}{n}": h @ w[:, i] for i, n in enumerate(nodes)}}
+                t, columns={**t.columns, **{f"{LATENT}{n}": h @ w[:, i] for i, n in enumerate(self.nodes)}}
             )
-            for t, h, w in zip(case.tables, hats, weights, strict=True)
+            for t, h, w in zip(self.case.tables, self.hats, at.flows, strict=True)
         )
+        case = dataclasses.replace(self.case, tables=tables)
         try:
-            plain = _at(dataclasses.replace(case, tables=tables), f.rough, model, z)
-            metric = Metric(plain, average, False)
+            plain = _at(case, self.f.rough, self.model, at.z)
+            metric = Metric(plain, self.average, False)
+            self.sizes = self.sizes or [
+                typical_flow(self.plant, n, metric.signals) or 1.0 for n in self.nodes
+            ]
         except SimulationError:
-            break
-        sizes = sizes or [typical_flow(plant, n, metric.signals) or 1.0 for n in nodes]
+            return None
         residual = [
             metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
         ]
-        size = sum(float(e @ e) for e in residual)
-        if best is not None and size >= best[0]:
-            break
-        by_node = [flow_rows(metric, n, hats, s) for n, s in zip(nodes, sizes, strict=True)]
+        return _Seen(plain, metric, residual, sum(float(e @ e) for e in residual))
+
+    def step(self, at: _Spot, seen: _Seen) -> tuple[_Followed, _Spot, float]:
+        """Return the plant linearised at a spot, the next spot, and the sum of squares promised there."""
+        metric, sizes = seen.metric, np.array(self.sizes)
+        by_node = [flow_rows(metric, n, self.hats, s) for n, s in zip(self.nodes, self.sizes, strict=True)]
         wide = [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
-        scaled = [(w / np.array(sizes)).T.ravel() for w in weights]
-        misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
-        best = size, _Followed(metric, misfit, wide)
+        scaled = [(w / sizes).T.ravel() for w in at.flows]
+        misfit = [e + x @ w for e, x, w in zip(seen.residual, wide, scaled, strict=True)]
         flows = _smoothed(wide, misfit, metric.own)
-        weights = [p.reshape(len(nodes), knots).T * np.array(sizes) for p in flows]
         left = [e - x @ p for e, x, p in zip(misfit, wide, flows, strict=True)]
-        z = _started(plain, metric, left)
-    if best is None:
+        own = [p.reshape(len(self.nodes), self.knots).T * sizes for p in flows]
+        aim = _Spot(own, _started(seen.plain, metric, left))
+        return _Followed(metric, misfit, wide), aim, sum(float(e @ e) for e in left)
+
+
+def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
+    """Follow the recordings with unknown flows into nodes. Raises SimulationError.
+
+    Knots act in their own recording only, so that each recording is solved alone. A whole step may lead a
+    plant that grows to where it has no bounds: then the step is shortened."""
+    if not nodes:
+        raise SimulationError("the plant has no node that an unknown flow could enter")
+    tracking = _Tracking(case, f, nodes)
+    here = aim = tracking.first
+    found: _Followed | None = None
+    size, share = np.inf, 1.0
+    for _ in range(STEPS + 1):
+        at = here.towards(aim, share)
+        seen = tracking.look(at)
+        if seen is None or not seen.size < size:
+            share *= SHORTER
+            if found is None or share < SHORTEST:
+                break
+            continue
+        here, size, share = at, seen.size, 1.0
+        found, aim, promised = tracking.step(here, seen)
+        if promised > (1 - SETTLED) * size:
+            break
+    if found is None:
         raise SimulationError("the plant cannot be tracked")
-    return best[1]
+    return found
 
 
 def _at(case: Case, fit: Fit, model: Model, z: np.ndarray) -> Plain:
