@@ -246,6 +246,14 @@ def test_a_signal_of_one_value_has_no_thresholds(visited, relays):
     assert all(f.values({"z": np.sin(t)}, t).shape == (100, f.count * len(f.form.sizes)) for f in found)
 
 
+@pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, {"even", "even_power"})])
+def test_a_signal_that_is_nowhere_negative_is_not_tried_with_two_equal_forms(least, twins):
+    """Of a leak of a tank, abs(z)**n and sign(z) * abs(z)**n had half the probability each, and an experiment."""
+    signal = Signal("z", ex.name("z"), None, visited=(least, 0.5, 1.0))
+    tried = {f.form.name for f in families([signal], [signal], 100.0, 1.0)}
+    assert tried & {"even", "even_power"} == twins and {"linear", "power"} <= tried
+
+
 def test_a_relay_in_the_plant_switches_where_the_one_of_the_regression_does():
     t = np.arange(400.0)
     z = np.sin(t / 30) + 0.3 * np.sin(t / 7)

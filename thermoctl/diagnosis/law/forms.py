@@ -58,6 +58,7 @@ class Form:
     memory: str | None = None
     odd: bool = False  # does the term change its sign with its signal?
     limit: str | None = None  # the form that it becomes at the upper bound of s, with the size A / s
+    twin: str | None = None  # the form that it equals where its signal is nowhere negative
 
 
 @cache
@@ -205,6 +206,8 @@ def families(
                 "input": z.recorded,
                 "loaded": z.drives,
             }
+            if form.twin and z.visited[0] >= 0:
+                continue  # the recordings cannot tell the two apart
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
