@@ -27,7 +27,7 @@ from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Term, families, library
-from thermoctl.diagnosis.law.propose import PROPOSALS
+from thermoctl.diagnosis.law.propose import PROPOSALS, propose_laws
 from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
 from thermoctl.diagnosis.law.refit import law_of as placed_law
 from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect
@@ -244,6 +244,42 @@ def test_a_signal_of_one_value_has_no_thresholds(visited, relays):
     t = np.arange(100.0)
     assert sum(f.form.name == "relay" for f in found) == relays
     assert all(f.values({"z": np.sin(t)}, t).shape == (100, f.count * len(f.form.sizes)) for f in found)
+
+
+CLAMP = """\
+format: thermoctl-plant/1
+title: Resistor and capacitor
+inputs:
+  u: {unit: V, between_samples: linear}
+parameters:
+  C: {value: 1.1e-5, unit: F, range: [5.0e-6, 2.0e-5]}
+nodes:
+  v: {unit: V, storage: C, initial: 0}
+flows:
+  charging: {into: v, rate: (u - v) / 1000, unit: A}
+outputs:
+  v_read: {value: v, unit: V, noise: 0.012}
+"""
+
+
+def test_a_diode_is_an_exponential():
+    """A diode's current grows e-fold in 26 to 50 mV: it was steeper than the library, and a sum of two kinks."""
+    plant, t = loads(CLAMP), np.arange(0, 0.4, 0.0008)
+    diode = Flow("diode", ex.parse("2e-9 * (exp(v / 0.046) - 1)"), "v", None)
+    truth = compile_plant(replace(plant, flows={**plant.flows, "diode": diode}))
+    drives = (1.5 * np.sin(57 * t) + 0.1, 2.2 * np.sin(31 * t))
+    tables = [truth.measure(Table(f"run_{k}", "", t, {"u": u}), k) for k, u in enumerate(drives)]
+    known = case(plant, tables, {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    steep = [
+        p
+        for p in propose_laws(known, null, limits())
+        if (p.place, [x.form.name for x in p.terms]) == (Place("v"), ["exponential"])
+    ]
+    law = refitted_law(known, null, steep[0], null)
+    (term,) = steep[0].terms
+    own = law.hypothesis.effects[0].own
+    assert abs(law.plant.parameters[own["s1"]].value * term.signals[0].size - 0.046) < 0.002
 
 
 @pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, {"even", "even_power"})])
