@@ -83,6 +83,23 @@ def test_trusted_sensors_have_no_faults(tmp_path):
         loads(text.replace("trusted", "right"))
 
 
+@pytest.mark.parametrize(
+    ("reading", "entry"),
+    [("heat", "trusted: true"), ("heat", "role: setpoint"), ("temperature_1", "trusted: true")],
+)
+def test_one_trusted_reading_has_no_faults(reading, entry, tmp_path):
+    text = PLANTS["two blocks"]
+    plant = loads(re.sub(rf"(  {reading}: {{)", rf"\1{entry}, ", text))
+    save(plant, tmp_path / "plant.yaml")
+    _, doubted = planned(rig("two blocks")[0], inputs("two blocks"))
+    _, trusted = planned(load(tmp_path / "plant.yaml"), inputs("two blocks"))
+    faults = {key for key in doubted if key[0].startswith("sensor_") and key[1] == reading}
+    assert faults and not faults & trusted.keys()
+    assert {key for key in doubted if key[1] != reading} <= trusted.keys()
+    with pytest.raises(InputError, match=f"trusted of '{reading}': true or false"):
+        loads(re.sub(rf"(  {reading}: {{)", r"\1trusted: 3, ", text))
+
+
 def test_a_plan_without_a_recording_settles_and_says_it_as_json(tmp_path, capsys):
     path = tmp_path / "plant.yaml"
     path.write_text(PLANTS["one block"])

@@ -73,7 +73,7 @@ class Conversion:
 class Input:
     """A recorded column that drives the simulation; `linear`: straight lines between samples, else held.
 
-    `stated`: does the plant file state which? By default an input is held."""
+    `stated`: does the plant file state which? By default an input is held. `trusted`: see `Plant.trusts`."""
 
     name: str
     unit: str | None = None
@@ -82,6 +82,7 @@ class Input:
     role: str | None = None
     conversion: Conversion | None = None
     stated: bool = False
+    trusted: bool = False
     at: str = _place()
 
 
@@ -127,7 +128,8 @@ class Flow:
 class Output:
     """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step.
 
-    `sensed`: if a diagnosis added an error of the electronics, the part of `value` that they read."""
+    `sensed`: if a diagnosis added an error of the electronics, the part of `value` that they read. `trusted`: see
+    `Plant.trusts`."""
 
     name: str
     value: Expr
@@ -137,6 +139,7 @@ class Output:
     resolution: float | None = None
     role: str | None = None
     conversion: Conversion | None = None
+    trusted: bool = False
     at: str = _place()
     sensed: Expr | None = None
 
@@ -148,7 +151,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Plant:
-    """A checked plant. `trusted`: are its sensors taken as correct in a diagnosis?"""
+    """A checked plant. `trusted`: are all its readings correct (`trusts`)?"""
 
     title: str
     inputs: Mapping[str, Input]
@@ -162,6 +165,11 @@ class Plant:
     def readings(self) -> tuple[Input | Output, ...]:
         """Return everything that has a column in a recording: inputs, then outputs."""
         return (*self.inputs.values(), *self.outputs.values())
+
+    def trusts(self, reading: str) -> bool:
+        """Return whether a diagnosis may not doubt a reading: a setpoint is known as it was sent, others if stated."""
+        item = self.inputs.get(reading) or self.outputs[reading]
+        return self.trusted or item.trusted or item.role == "setpoint"
 
     def plain(self) -> dict[str, Any]:
         """Return the file's content as plain dicts and lists; `files.from_plain` is the inverse."""
@@ -185,7 +193,9 @@ def _given(**items: Any) -> dict[str, Any]:
 def _input(i: Input) -> dict[str, Any]:
     column = _column(i)
     between = "linear" if i.linear else "hold" if i.stated else None
-    return _given(unit=i.unit, column=column, between_samples=between, role=i.role)
+    return _given(
+        unit=i.unit, column=column, between_samples=between, role=i.role, trusted=i.trusted or None
+    )
 
 
 def _column(item: Input | Output) -> str | dict[str, Any] | None:
@@ -228,6 +238,7 @@ def _output(o: Output) -> dict[str, Any]:
         noise=_given(**asdict(o.noise)) if isinstance(o.noise, SensorNoise) else o.noise,
         resolution=o.resolution,
         role=o.role,
+        trusted=o.trusted or None,
     )
 
 

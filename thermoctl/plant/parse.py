@@ -112,7 +112,8 @@ def _input(name: str, s: Section) -> Input:
     stated = s.get("between_samples", False) is not None
     linear = s.text("between_samples", "hold", ("hold", "linear")) == "linear"
     column, conversion = _column(s, name)
-    item = Input(name, _unit(s), column, linear, _role(s), conversion, stated, _at(s))
+    trusted = s.flag("trusted", False)
+    item = Input(name, _unit(s), column, linear, _role(s), conversion, stated, trusted, _at(s))
     s.end()
     return item
 
@@ -194,6 +195,7 @@ def _output(name: str, s: Section) -> Output:
         s.optional_number("resolution", low=0.0),
         _role(s),
         conversion,
+        s.flag("trusted", False),
         _at(s),
     )
     s.end()

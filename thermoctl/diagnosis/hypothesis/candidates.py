@@ -38,16 +38,16 @@ def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:
 def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     """Return every effect at every place where it can act, with every choice of the signals it needs.
 
-    A plant with trusted sensors has no faults of readings."""
+    A reading that the plant trusts has no fault."""
     out = []
     for effect in effects.values():
-        if rig.plant.trusted and effect.where in FAULTS:
-            continue
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
         for place in PLACES[effect.where](rig):
             here = effect.at(place.exponent)
             if here is None or not askable(rig, place):
+                continue
+            if effect.where in FAULTS and rig.plant.trusts(place.where):
                 continue
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(_choices(rig, effect, place)):

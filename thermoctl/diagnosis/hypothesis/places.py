@@ -254,7 +254,7 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 
 # Places where an effect is an error of a reading.
 ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")
-FAULTS = (*ERRORS, "reading_in_air")  # places that do not exist in a plant with `sensors: trusted`
+FAULTS = (*ERRORS, "reading_in_air")  # places that a trusted reading is not (`Plant.trusts`)
 PLACES = {
     "node": lambda rig: _nodes(_storing(rig), "n"),
     "node_pair": _exchanging,
