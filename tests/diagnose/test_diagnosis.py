@@ -15,6 +15,7 @@ from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.report.explain import why
 from thermoctl.diagnosis.result import doubts
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads
@@ -299,9 +300,19 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     write(run, "t,force,encoder", rows)
     r = diagnosed([plant, run], tmp_path / "out")
     # those that contain it, with another part too small to show, keep some probability, and are a family
-    assert [f["effect"] for f in r["findings"]] == ["coulomb_friction"] and r["verdict"] == "ambiguous"
-    assert r["families"][0]["probability"] > 0.95
-    assert {a["effect"] for a in r["alternatives"]} == {"directional_friction", "stribeck_friction"}
+    (family,) = r["findings"]
+    assert r["verdict"] == "ambiguous" and family["probability"] > 0.95 and family["where"] == "velocity"
+    assert family["effect"] == " or ".join(m["effect"] for m in family["members"]) and not r["families"]
+    assert family["members"][: len(r["alternatives"])] == r["alternatives"]
+    assert family["members"][0]["effect"] == "coulomb_friction"
+    size = family["parameters"]["F_coulomb_friction_velocity"]
+    assert size["value"] == pytest.approx(1.5, abs=3 * size["sd"])
+    report = (tmp_path / "out/report.html").read_text()
+    assert "One of coulomb friction at velocity" in report and "do not tell which" in report
+    reasons = {why(r, m["effect"]) for m in family["members"]}
+    assert all("one of its family is there, and these data do not tell which" in text for text in reasons)
+    given = load(tmp_path / "out/plant.yaml").parameters["F_coulomb_friction_velocity"]
+    assert given.value == pytest.approx(size["value"])
 
 
 @pytest.mark.parametrize(("least", "absent"), [(1e-5, True), (1e-6, False)])  # m, of X0

@@ -74,15 +74,18 @@ def test_findings_are_told_by_size_with_units():
 
 def test_effects_that_imitate_each_other_are_told_together():
     two = [RADIATION | {"probability": 0.5}, LAG | {"probability": 0.46, "parameters": {}}]
-    found = FOUND | {"verdict": "ambiguous", "findings": [], "alternatives": two}
-    found["families"] = [{"effects": two, "probability": 0.97}]
+    family = RADIATION | {"effect": "radiation or sensor_lag", "probability": 0.97, "members": two}
+    found = FOUND | {"verdict": "ambiguous", "findings": [family], "alternatives": two}
     assert words(found).startswith(
         "One of these is there (probability 0.97), and these recordings do not tell which: "
         "radiation at block (0.50), sensor lag at reading (0.46)."
     )
     told = words(found | {"alternatives": [*two, LAG | {"effect": "creep", "probability": 0.3}]})
     assert "Candidates, the likeliest first: radiation" in told
-    assert "One of these is there (probability 0.97): radiation at block or sensor lag at reading." in told
+    one = "One of these is there (probability 0.97): radiation at block or sensor lag at reading."
+    assert one in told and one in words(FOUND | {"families": [{"members": two, "probability": 0.97}]})
+    told = words(FOUND | {"findings": [LAG, family]})
+    assert told.startswith("Found: sensor lag of 4.21 s at reading (probability 0.98). " + one)
 
 
 @pytest.mark.parametrize(

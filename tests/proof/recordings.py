@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.proof.rigs import RIGS, Rig
-from tests.proof.score import CONFIDENT
+from tests.proof.score import CONFIDENT, meant
 from tests.truth.run import diagnose
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
@@ -84,14 +84,14 @@ def rig_job(folder: Path, rig: Rig) -> Job:
 
 def _entry(rig: Rig, result: Mapping[str, Any] | None, run: Run) -> Entry:
     result = result or {"verdict": "failed", "findings": [], "fit": {}}
-    named = {f["effect"]: float(f["probability"]) for f in result["findings"]}
+    named = {e: float(f["probability"]) for f in result["findings"] for e, _ in meant(f)}
     known = frozenset().union(*rig.accepted, rig.tolerated)
     return Entry(
         rig.name,
         result["verdict"],
         [(f["effect"], f["where"], f["probability"]) for f in result["findings"]],
         [max((named[e] for e in options if e in named), default=0.0) for options in rig.accepted],
-        [e for e in named if e not in known],
+        [f["effect"] for f in result["findings"] if not known & {e for e, _ in meant(f)}],
         _ratio(result["fit"]),
         (result.get("remainder") or {}).get("share_closed"),
         run.get("cpu_s"),

@@ -129,11 +129,23 @@ class Truth:
             or any(same_place(e, place, w) and e == effect for e, w in self.equivalent_places)
         )
 
+    def nearest(self, finding: Mapping[str, Any]) -> Named:
+        """Return what a finding names; of a family the member that is nearest to the truth."""
+        return max(
+            meant(finding),
+            key=lambda n: (self.named_by(n) and self.at(n), self.named_by(n), self.of_misfit(n)),
+        )
+
     def holds(self, found: Named) -> bool:
         """Check whether effect and place are exactly true; equivalents do not count."""
         effect, place = found
         right = any(effect == e and same_place(e, place, w) for e, w in self.effects)
         return right or found in self.also_right or self.of_misfit(found)
+
+
+def meant(finding: Mapping[str, Any]) -> list[Named]:
+    """Return what a finding names: its effect, or the members of its family."""
+    return [(m["effect"], m["where"]) for m in finding.get("members", [finding])]
 
 
 def _kind(effects: Sequence[Named]) -> str:
@@ -156,7 +168,7 @@ def score(
     truth = Truth.of(case, answer)
     result = result or FAILED
     verdict = result["verdict"]
-    findings = [(f["effect"], f["where"]) for f in result["findings"]]
+    findings = [truth.nearest(f) for f in result["findings"]]
     everything = findings + [(f["effect"], f["where"]) for f in result["alternatives"]]
     right_by_name = [f for f in findings if truth.named_by(f)]
     of_misfits = [f for f in findings if f not in right_by_name and truth.of_misfit(f)]
@@ -194,7 +206,7 @@ def score(
         strays=len(others) - len(right_by_name),
         of_misfits=len(of_misfits),
         calibration=[
-            (float(f["probability"]), truth.holds((f["effect"], f["where"])))
+            (float(f["probability"]), any(map(truth.holds, meant(f))))
             for f in [*result["findings"], *result["alternatives"]]
         ],
         parameters=_parameters(truth.effects, answer.get("parameters", []), result["findings"]),

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NotRequired, TypedDict
 
-from tests.proof.score import CONFIDENT, score
+from tests.proof.score import CONFIDENT, meant, score
 from tests.proof.statistics import Share, share
-from tests.truth.cases import STRAY, TOLERATED, Case
+from tests.truth.cases import RIGHT, STRAY, TOLERATED, Case
 
 SURE = 0.99
 BANDS = ("large", "middle", "small")
@@ -38,10 +38,15 @@ def row(case: Case, result: Mapping[str, Any] | None, cpu_s: float, error: str |
     """Judge one diagnosis; `result` None where it failed with `error`."""
     findings = (result or {}).get("findings", [])
     names: list[Name] = [
-        (f["effect"], f["where"], round(float(f["probability"]), 4), case.judge((f["effect"], f["where"])))
+        (
+            f["effect"],
+            f["where"],
+            round(float(f["probability"]), 4),
+            max(map(case.judge, meant(f)), key=(STRAY, TOLERATED, RIGHT).index),
+        )
         for f in findings
     ]
-    sure = [(e, w) for e, w, p, _ in names if p >= CONFIDENT]
+    sure = [n for f in findings if f["probability"] >= CONFIDENT for n in meant(f)]
     parameters = (
         score(case.job.name, case.answer, result).parameters if "nearly_the_same" in case.answer else []
     )

@@ -37,7 +37,8 @@ class FoundEffect:
     """One effect that the plant lacks.
 
     `confirmed`: probability that it predicts data that it was not fitted to. `parameters`: value, sd and
-    unit by name; `when`: intervals."""
+    unit by name; `when`: intervals. `members`: of a family whose effects the data do not tell apart, each
+    with effect, where and probability. Equation and parameters are then of the one in the plant."""
 
     effect: str
     where: str
@@ -47,6 +48,7 @@ class FoundEffect:
     parameters: Mapping[str, Mapping[str, Any]]
     summary: str
     when: Sequence[Sequence[float]] | None = None
+    members: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True)

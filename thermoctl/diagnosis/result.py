@@ -37,6 +37,7 @@ FOLLOWS = 0.3
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
+UNTOLD = "one of its family is there, and these data do not tell which"
 # Number of blocks of a recording; least rms of a block with a large error, over that of the recording.
 BLOCKS, LARGE = 40, 1.5
 
@@ -78,7 +79,16 @@ class Diagnosis:
         effects = [e for e in self.best.hypothesis.effects if not isinstance(e, PlacedLaw)]
         if self.decision.verdict == "ambiguous":
             return tuple(effects)
-        return tuple(e for e in effects if e.key in self.decision.named)
+        return tuple(e for e in effects if e.key in self.decision.named or e.key in self.of_family)
+
+    @cached_property
+    def of_family(self) -> Mapping[Key, Family]:
+        """Return effects of the plant with their families, which are certain: these are the findings."""
+        if self.decision.verdict in ("consistent", "unexplained"):
+            return {}
+        mine = self.best.hypothesis.keys
+        several = [f for f in self.families if len({e for e, _ in f.members}) > 1]
+        return {next(k for k in f.members if k in mine): f for f in several if mine & {*f.members}}
 
     @property
     def refused(self) -> Keys:
@@ -124,7 +134,7 @@ def curves(d: Diagnosis) -> list[Curve]:
 
 def contract(d: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json, with `next_experiment`, `not_seen` and `seconds` still empty."""
-    keys = {e.key for e in d.shown}
+    keys = {e.key for e in d.shown} - d.of_family.keys()
     stays = d.law is not None or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
     outputs = d.case.plant.outputs
     return _plain(
@@ -139,14 +149,9 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 if (e, w) not in keys
             ],
             "families": [
-                {
-                    "effects": [
-                        {"effect": e, "where": w, "probability": round(d.posterior.effects[e, w], 4)}
-                        for e, w in f.members
-                    ],
-                    "probability": round(f.probability, 4),
-                }
+                {"members": _members(d, f), "probability": round(f.probability, 4)}
                 for f in d.families
+                if f not in d.of_family.values()
             ],
             "mismatch": _mismatch(d),
             "remainder": {
@@ -253,6 +258,7 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
     first = ends.get("onset", ends.get("start"))
     equation = _equation(plant, e)
     figures = ", ".join(f"{n} = {p.value:.4g} {p.unit or ''}".strip() for n, p in values.items())
+    family = d.of_family.get(e.key)
     return {
         "effect": e.key[0],
         "where": e.key[1],
@@ -264,7 +270,24 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
             n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
         },
         "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
+        **(_of_family(d, family) if family else {}),
     }
+
+
+def _of_family(d: Diagnosis, f: Family) -> dict[str, Any]:
+    """Return what a finding says of its family; the rest of it is of the member in the plant."""
+    return {
+        "effect": " or ".join(dict.fromkeys(e for e, _ in f.members)),
+        "probability": round(f.probability, 4),
+        "confirmed": round(max((d.asked[k] for k in f.members if k in d.asked), default=1.0), 4),
+        "members": _members(d, f),
+    }
+
+
+def _members(d: Diagnosis, f: Family) -> list[dict[str, Any]]:
+    return [
+        {"effect": e, "where": w, "probability": round(d.posterior.effects[e, w], 4)} for e, w in f.members
+    ]
 
 
 def _equation(after: Plant, e: Placed) -> str:
@@ -364,7 +387,8 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
 def _lost(d: Diagnosis) -> list[dict[str, Any]]:
     """Return the fitted effects that are not findings, each in its best hypothesis, with the reason."""
     out: dict[Key, dict[str, Any]] = {}
-    shown = {e.key for e in d.shown}
+    shown = {e.key for e in d.shown} - d.of_family.keys()
+    open_ = {k for f in d.of_family.values() for k in f.members}
     final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
     for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
@@ -375,7 +399,9 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
                 "beside": sorted(f"{e} at {at}" for e, at in keys - {key}),
                 "probability": d.posterior.effects.get(key, 0.0),
                 "below_best": final - w.score,
-                "reason": UNCONFIRMED
+                "reason": UNTOLD
+                if key in open_
+                else UNCONFIRMED
                 if key in d.refused
                 else "less likely than the result"
                 if w.score < final

@@ -128,8 +128,8 @@ class Flow:
 class Output:
     """A sensor: `value` without error, `noise` its random error (a number: white), `resolution` its step.
 
-    `sensed`: if a diagnosis added an error of the electronics, the part of `value` that they read. `trusted`: see
-    `Plant.trusts`."""
+    `sensed`: if a diagnosis added an error of the electronics, the part of `value` that they read.
+    `trusted`: see `Plant.trusts`."""
 
     name: str
     value: Expr
@@ -167,7 +167,7 @@ class Plant:
         return (*self.inputs.values(), *self.outputs.values())
 
     def trusts(self, reading: str) -> bool:
-        """Return whether a diagnosis may not doubt a reading: a setpoint is known as it was sent, others if stated."""
+        """Return whether a reading is right: if stated, and a setpoint always, as it was sent."""
         item = self.inputs.get(reading) or self.outputs[reading]
         return self.trusted or item.trusted or item.role == "setpoint"
 
@@ -193,9 +193,7 @@ def _given(**items: Any) -> dict[str, Any]:
 def _input(i: Input) -> dict[str, Any]:
     column = _column(i)
     between = "linear" if i.linear else "hold" if i.stated else None
-    return _given(
-        unit=i.unit, column=column, between_samples=between, role=i.role, trusted=i.trusted or None
-    )
+    return _given(unit=i.unit, column=column, between_samples=between, role=i.role, trusted=i.trusted or None)
 
 
 def _column(item: Input | Output) -> str | dict[str, Any] | None:

@@ -123,7 +123,9 @@ def _findings(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
         for n in f["parameters"]:
             end = n.removeprefix(figures.short(n, f)) or end
         sure = f"probability {chance(f['probability'])}; that other data confirm it {chance(f['confirmed'])}"
-        body += f"<h3>{html.escape(name(f))}</h3>{_p(f'{effect.title}: {sure}.')}"
+        kinds = ", ".join(f"{name(m)} ({chance(m['probability'])})" for m in f.get("members", ()))
+        what = f"One of {kinds}, of which the plant has: {effect.title}" if kinds else effect.title
+        body += f"<h3>{html.escape(name(f))}</h3>{_p(f'{what}; {sure}.')}"
         body += f"<pre>{html.escape(figures.equation(f))}</pre>"
         heads, rows = figures.parameter_rows(f)
         body += _table((heads, [(*r[:2], unit(r[2])) for r in rows]))

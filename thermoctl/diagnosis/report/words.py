@@ -136,18 +136,16 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
             f", and yet something may be missing: {perhaps}." if perhaps else ": nothing is missing."
         )
     if result["verdict"] == "ambiguous":
-        every = sorted([*result["findings"], *result["alternatives"]], key=lambda a: -a["probability"])
+        every = _single(result)
         candidates = ", ".join(f"{name(a)} ({chance(a['probability'])}{_doubt(a)})" for a in every[:4])
-        whole = [
-            f for f in result.get("families", ()) if _members(f) >= {(a["effect"], a["where"]) for a in every}
-        ]
+        whole = [f for f in _certain(result) if _members(f) >= {(a["effect"], a["where"]) for a in every}]
         if whole:
             sure = chance(whole[0]["probability"])
             return f"One of these is there (probability {sure}), and these recordings do not tell which: {candidates}."
         text = "Something is missing, but these recordings do not name it for sure"
         return text + (f". Candidates, the likeliest first: {candidates}." if candidates else ".")
-    if result["findings"]:
-        names = [f"{name(f)} (probability {chance(f['probability'])})" for f in result["findings"]]
+    if named := [f for f in result["findings"] if "members" not in f]:
+        names = [f"{name(f)} (probability {chance(f['probability'])})" for f in named]
         return f"Found: {listed(names)}."
     law = (result["remainder"] or {}).get("law")
     if law:
@@ -161,16 +159,27 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
 
 def _families(result: Result) -> list[str]:
     """Return a sentence for each family of effects that imitate each other, unless `_found` has it."""
-    mentioned = {(a["effect"], a["where"]) for a in (*result["findings"], *result["alternatives"])}
+    mentioned = {(a["effect"], a["where"]) for a in _single(result)}
     return [
-        f"One of these is there (probability {chance(f['probability'])}): {' or '.join(map(name, f['effects']))}."
-        for f in result.get("families", ())
+        f"One of these is there (probability {chance(f['probability'])}): {' or '.join(map(name, f['members']))}."
+        for f in _certain(result)
         if result["verdict"] != "ambiguous" or not _members(f) >= mentioned
     ]
 
 
+def _certain(result: Result) -> list[Result]:
+    """Return the families of which one effect is certain."""
+    return [f for f in (*result["findings"], *result.get("families", ())) if "members" in f]
+
+
+def _single(result: Result) -> list[Result]:
+    """Return findings that are no families, and alternatives, the likeliest first."""
+    every = [e for e in (*result["findings"], *result["alternatives"]) if "members" not in e]
+    return sorted(every, key=lambda e: -e["probability"])
+
+
 def _members(family: Result) -> set[tuple[str, str]]:
-    return {(e["effect"], e["where"]) for e in family["effects"]}
+    return {(e["effect"], e["where"]) for e in family["members"]}
 
 
 def _doubt(alternative: Result) -> str:
