@@ -224,36 +224,45 @@ def test_the_lag_of_what_holds_goes_on_straight_lines_in_one_form(tmp_path):
     )
 
 
+def swept_stage(folder, read):
+    """Two recordings of a stage on springs that is swept slowly; `read`: of its position in m, with noise."""
+    t = np.arange(0.0, 20.0, 0.005)
+    paths = [folder / "plant.yaml"]
+    A, B = np.array([[-33 / 1.3, -640 / 1.3], [1, 0]]), np.array([[1 / 1.3], [0]])
+    *stage, h = cont2discrete((A, B, np.array([[0, 1]]), np.zeros((1, 1))), 0.005)
+    for seed in (1, 2):
+        rng = np.random.default_rng(seed)
+        force = np.interp(t, np.arange(0, 21, 1.0), rng.uniform(-10, 10, 21))
+        x = dlsim((*stage, h), force)[1][:, 0]
+        y = read(x, rng.normal(0, 2e-6, len(t)))
+        paths.append(folder / f"run_{seed}.csv")
+        write(paths[-1], "t,force,encoder", np.column_stack([t, force, y]))
+    return paths
+
+
 @pytest.mark.parametrize(("period", "size", "rows"), [(0.25e-3, 3e-6, 6000), (0.06e-3, 0.3e-6, 500)])
 def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path, monkeypatch, period, size, rows):
     """The shorter one passes more than once in a sample, and 8 samples are summed in a row of the screening."""
     monkeypatch.setattr("thermoctl.diagnosis.search.screening.ROWS", rows)
     (tmp_path / "plant.yaml").write_text(SPRING_STAGE)
-    t = np.arange(0.0, 20.0, 0.005)
-    paths = [tmp_path / "plant.yaml"]
-    for seed in (1, 2):
-        rng = np.random.default_rng(seed)
-        force = np.interp(t, np.arange(0, 21, 1.0), rng.uniform(-10, 10, 21))
-        A, B, C, D, _ = cont2discrete(
-            (
-                np.array([[-33 / 1.3, -640 / 1.3], [1, 0]]),
-                np.array([[1 / 1.3], [0]]),
-                np.array([[0, 1]]),
-                np.zeros((1, 1)),
-            ),
-            0.005,
-        )
-        x = dlsim((A, B, C, D, 0.005), force)[1][:, 0]
-        y = x + size * np.sin(2 * np.pi * x / period + 0.7) + rng.normal(0, 2e-6, len(t))
-        assert np.ptp(x) > 70 * period
-        paths.append(tmp_path / f"run_{seed}.csv")
-        write(paths[-1], "t,force,encoder", np.column_stack([t, force, y]))
+    paths = swept_stage(tmp_path, lambda x, noise: x + size * np.sin(2 * np.pi * x / period + 0.7) + noise)
     r = diagnosed(paths, tmp_path / "out")
     assert r["verdict"] == "explained" and [(f["effect"], f["where"]) for f in r["findings"]] == [
         ("cyclic_error", "encoder")
     ]
     found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
     assert found["P"] == pytest.approx(period, rel=1e-3) and abs(found["A"]) == pytest.approx(size, rel=0.1)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_steps_of_an_encoder_are_no_cyclic_error(tmp_path, stated):
+    """A rounded reading errs with the period of its step, however long the recording makes that certain."""
+    step = 8e-6
+    noise = f"noise: 2e-6, resolution: {step}" if stated else f"noise: {np.hypot(2e-6, step / 12**0.5)}"
+    (tmp_path / "plant.yaml").write_text(re.sub(r"noise: 2e-6\b[^}]*", noise, SPRING_STAGE))
+    paths = swept_stage(tmp_path, lambda x, noise: step * np.round((x + noise) / step))
+    r = diagnosed(paths, tmp_path / "out")
+    assert r["verdict"] == "consistent" and not r["findings"]
 
 
 def test_dry_friction_that_sticks_is_no_load(tmp_path):

@@ -14,6 +14,11 @@ from thermoctl.plant.simulation.simulate import Simulation
 
 REPEATED = 2.0  # least number of periods over the span of the signal
 BEYOND = 1 / 3, 2 / 3  # levels above the last quantile: shares of the way to the extreme
+LEAST_STEPS = (
+    1.5  # least period of a reading's error, in steps of the reading: rounding has the period of one
+)
+ROUNDED = 1e-9  # gap between readings that only the arithmetic makes, over their range
+WHOLE = 0.01  # largest distance of a rounded reading from a multiple of its step, in steps
 # Periods over the span of the signal: up to the first number all are tried, up to the second the strongest.
 SLOW_TURNS, FINE_TURNS = 60.0, 4000
 STRONGEST = 16  # number of the strongest periods that are tried
@@ -115,7 +120,23 @@ def _positions(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> G
     j = list(rig.plant.outputs).index(candidate.place.output)
     errors = [d.y[:, j] - run.y[:, j] for d, run in zip(rig.drives, runs, strict=True)]
     fine = {"longest": longest, "picked_from": 4.0 * FINE_TURNS}
-    return slow + [{"period": float(span / n), **fine} for n in _fine_turns(x, errors, span)]
+    every = slow + [{"period": float(span / n), **fine} for n in _fine_turns(x, errors, span)]
+    steps = (_step(d.y[:, j]) for d in rig.drives)
+    step = max(rig.plant.outputs[candidate.place.output].resolution or 0.0, *steps)
+    moved = float(np.ptp(np.concatenate([run.y[:, j] for run in runs]))) or np.inf
+    least = LEAST_STEPS * step * span / moved
+    return [p for p in every if p["period"] > least]
+
+
+def _step(y: np.ndarray) -> float:
+    """Return the step of a reading (N,): all its values are multiples of it from the first; else 0."""
+    values = np.unique(y[np.isfinite(y)])
+    if len(values) < 2:
+        return 0.0
+    gaps = np.diff(values)
+    step = float(gaps[gaps > ROUNDED * (values[-1] - values[0])].min())
+    part = (values - values[0]) / step
+    return step if np.abs(part - np.round(part)).max() < WHOLE else 0.0
 
 
 def _levels(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> Grid:
