@@ -46,12 +46,12 @@ prove: develop                     # the full proof on concealed cases: made, se
 	$(BIN)/python -m tests.proof $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
 .PHONY: truth
-truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60; SEED= other generated cases
-	$(BIN)/python -m tests.truth --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(filter file,$(origin SEED)),,--seed $(SEED)) $(if $(OLD),--old $(OLD))
+truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60; SEED= other generated cases, FORM=coarse or late
+	$(BIN)/python -m tests.truth --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(filter file,$(origin SEED)),,--seed $(SEED)) $(if $(FORM),--form $(FORM)) $(if $(OLD),--old $(OLD))
 
 .PHONY: ablate
 ablate: truth                      # what each rule of the decision is worth: the cases of make truth without it; SEARCH=1: those of the search, hours
-	$(BIN)/python -m tests.truth.ablate --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(SEARCH),--search)
+	$(BIN)/python -m tests.truth.ablate --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(FORM),--form $(FORM)) $(if $(SEARCH),--search)
 
 CALIBRATION ?= build/calibration
 calibrate-diagnosis: develop       # set the numbers of config/diagnosis.yaml from generated cases and THERMOCTL_RECORDINGS; hours; run again to continue

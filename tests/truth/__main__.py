@@ -1,6 +1,6 @@
 """Judge the diagnosis on frozen cases: make (once), diagnose, compare with an older result.
 
-    python -m tests.truth [--number 60] [--seed S] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
+    python -m tests.truth [--number 60] [--seed S] [--form coarse] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
 
 OUT/result.json holds the result. A diagnosis is kept for the same case and the same program: run it again to
 continue. docs/proof/truth.md shows what this prints.
@@ -18,6 +18,7 @@ from typing import Any
 
 from tests.proof.prove import commit
 from tests.truth.cases import Case, foreign, generated, home
+from tests.truth.forms import FORMS
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import diagnose
 from thermoctl.fleet.batch import Reporter, run_all
@@ -42,7 +43,7 @@ def cases(a: argparse.Namespace) -> list[Case]:
     wanted = a.only.split(",")
     found = [*(home(say) if "home" in wanted else ()), *(foreign(say) if "foreign" in wanted else ())]
     if {"closed", "open"} & set(wanted):
-        made = generated(a.out / "cases", (a.number + 1) // 2, a.workers, say, a.seed)
+        made = generated(a.out / "cases", (a.number + 1) // 2, a.workers, say, a.seed, a.form)
         found += [c for c in made if c.group in wanted]
     return found
 
@@ -95,6 +96,7 @@ def options(p: argparse.ArgumentParser) -> None:
     """Add the options that choose the cases."""
     p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
     p.add_argument("--seed", type=int, help="other generated cases: those of this seed, in both worlds")
+    p.add_argument("--form", choices=FORMS, help="generated cases in another form (tests/truth/forms.py)")
     p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
     p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     p.add_argument(
@@ -118,8 +120,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     new = write(
         judged(found, a.out / "diagnoses", a.workers), a.out / "result.json", *([a.keep] if a.keep else [])
     )
-    if a.old.exists():
-        old = json.loads(a.old.read_text())
+    old = json.loads(a.old.read_text()) if a.old.exists() else {"cases": {}}
+    if old["cases"].keys() & new["cases"].keys():
         old, now = shared(old, new), shared(new, old)
         print(table({f"{old['date']}, {old['commit']}": old, f"{now['date']}, {now['commit']}": now}))
         print(f"\n{compared(old, now)}")

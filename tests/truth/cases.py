@@ -20,6 +20,7 @@ from tests.concealed import generate
 from tests.proof.recordings import VARIABLE, rig_job
 from tests.proof.rigs import RIGS, Rig
 from tests.proof.score import Named, Truth, same_place
+from tests.truth.forms import changed
 from thermoctl.files.yamlfile import load
 from thermoctl.fleet.jobs import Job
 
@@ -49,9 +50,16 @@ class Case:
 
 
 def generated(
-    folder: Path, number: int, workers: int, say: Callable[[str], None], seed: int | None = None
+    folder: Path,
+    number: int,
+    workers: int,
+    say: Callable[[str], None],
+    seed: int | None = None,
+    form: str | None = None,
 ) -> list[Case]:
-    """Return the first `number` cases of each world, of its frozen seed or of `seed`; those that are not there are made."""
+    """Return the first `number` cases of each world, of its frozen seed or of `seed`, in a form of FORMS.
+
+    Those that are not there are made."""
     root = folder / (_generator() if seed is None else f"{_generator()}-{seed}")
     seeds = SEEDS if seed is None else dict.fromkeys(SEEDS, seed)
     todo = [
@@ -69,12 +77,13 @@ def generated(
             ):
                 say(done.result())
     found = []
-    mark = "" if seed is None else f"-{seed}"
+    mark = "".join(f"-{x}" for x in (seed, form) if x is not None)
     for world in seeds:
         for n in range(number):
             case = root / world / f"{n + 1:04d}"
             if (case / "answer.yaml").exists():
-                found.append(_generated(world, f"{world}{mark}-{case.name}", case))
+                name = f"{world}{mark}-{case.name}"
+                found.append(_generated(world, name, changed(case, form) if form else case))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import yaml
 
@@ -13,6 +14,7 @@ from tests.truth import __main__ as truth
 from tests.truth import ablate, judge, run
 from tests.truth import cases as made
 from tests.truth.ablate import RULES, left_out, part_of
+from tests.truth.forms import FORMS, changed
 from thermoctl.diagnosis.limits import limits
 
 
@@ -62,6 +64,35 @@ def test_a_generated_case_takes_an_equivalent_name_and_is_a_trap_without_an_effe
     strange = {"verdict": "unexplained", "effects": [["?", "a"]], "nearly_the_same": [], "kind": "unknown"}
     trap = a_case(tmp_path / "0002", strange, lambda f: made._generated("closed", f"closed-{f.name}", f))
     assert not trap.wanted and trap.judge(("radiation", "a")) == "stray"
+
+
+def test_other_forms_of_a_case_are_coarse_or_late_and_keep_the_answer(tmp_path):
+    """A ramp of 1 V/s every 0.1 s, with one reading lost."""
+    case = a_case(tmp_path / "closed" / "0001", {}, lambda folder: folder)
+    (case / "run_2.csv").unlink()
+    outputs = {"ramp": {"value": "x", "column": "V", "noise": 0.05, "resolution": 0.03}}
+    (case / "plant.yaml").write_text(yaml.safe_dump({"outputs": outputs}))
+    t = np.arange(50) / 10
+    lines = [f"{a},{'' if k == 7 else a}" for k, a in enumerate(t)]
+    (case / "run_1.csv").write_text("\n".join(["t,V", *lines]) + "\n")
+    read = {}
+    for form in FORMS:
+        folder = changed(case, form)
+        assert folder == tmp_path / f"closed-{form}" / "0001" and (folder / "answer.yaml").exists()
+        read[form] = np.genfromtxt(folder / "run_1.csv", delimiter=",", skip_header=1)
+        assert np.array_equal(read[form][:, 0], t) and np.flatnonzero(np.isnan(read[form][:, 1])) == [7]
+    step = yaml.safe_load((tmp_path / "closed-coarse/0001/plant.yaml").read_text())["outputs"]["ramp"][
+        "resolution"
+    ]
+    assert step == pytest.approx(0.21)  # the least multiple of 0.03 from four times 0.05
+    seen = np.delete(read["coarse"], 7, axis=0)
+    assert (
+        np.allclose(seen[:, 1] / step, np.round(seen[:, 1] / step))
+        and np.abs(seen[:, 1] - seen[:, 0]).max() <= 0.105
+    )
+    after = np.delete(read["late"][:-1], 7, axis=0)
+    ahead = after[:, 1] - after[:, 0]
+    assert 0 <= ahead.min() < 0.005 and 0.015 < ahead.max() <= 0.02
 
 
 def test_figures_of_a_hand_made_group(tmp_path):
