@@ -320,6 +320,9 @@ def test_hysteresis_of_no_width_is_dry_friction(tmp_path):
     assert "One of coulomb friction at velocity" in report and "do not tell which" in report
     reasons = {why(r, m["effect"]) for m in family["members"]}
     assert all("one of its family is there, and these data do not tell which" in text for text in reasons)
+    told = {" + ".join(h["effects"]): h["why_not"] for h in r["hypotheses"]}
+    assert [h for h, why_not in told.items() if why_not is None] == ["coulomb_friction at velocity"]
+    assert told[""] == "less likely than the result"
     given = load(tmp_path / "out/plant.yaml").parameters["F_coulomb_friction_velocity"]
     assert given.value == pytest.approx(size["value"])
 

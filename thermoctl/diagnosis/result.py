@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -22,7 +23,7 @@ from thermoctl.diagnosis.law.refit import PlacedLaw
 from thermoctl.diagnosis.law.result import law_entry
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
-from thermoctl.diagnosis.search.beam import Searched
+from thermoctl.diagnosis.search.beam import Searched, Weighed
 from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
@@ -368,6 +369,7 @@ def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
                 "log_evidence": w.fitted.log_evidence - null,
                 "log_prior_odds": w.log_odds,
                 "posterior": d.posterior.hypotheses.get(keys, 0.0),
+                "why_not": None if keys == d.final.hypothesis.keys else _why_not(d, w, keys),
                 "physics": None if physics is None else [physics[k] for k in sorted(keys)],
                 "remainder": max(w.fitted.average.remainder),
                 "rms": w.fitted.fit.rms(),
@@ -388,8 +390,6 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
     """Return the fitted effects that are not findings, each in its best hypothesis, with the reason."""
     out: dict[Key, dict[str, Any]] = {}
     shown = {e.key for e in d.shown} - d.of_family.keys()
-    open_ = {k for f in d.of_family.values() for k in f.members}
-    final = next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
     for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
         for key in sorted(keys - shown - out.keys()):
@@ -398,18 +398,27 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
                 "where": key[1],
                 "beside": sorted(f"{e} at {at}" for e, at in keys - {key}),
                 "probability": d.posterior.effects.get(key, 0.0),
-                "below_best": final - w.score,
-                "reason": UNTOLD
-                if key in open_
-                else UNCONFIRMED
-                if key in d.refused
-                else "less likely than the result"
-                if w.score < final
-                else "fits better, but not surely enough for a name"
-                if key in standouts(d.physics.get(keys, {}))
-                else "does not stand out of the misfit that it leaves",
+                "below_best": _final_score(d) - w.score,
+                "reason": _why_not(d, w, {key}),
             }
     return sorted(out.values(), key=lambda e: (-e["probability"], e["below_best"]))
+
+
+def _why_not(d: Diagnosis, w: Weighed, keys: AbstractSet[Key]) -> str:
+    """Return why a hypothesis with these effects is not the result."""
+    if any(keys & {*f.members} for f in d.of_family.values()):
+        return UNTOLD
+    if keys & d.refused:
+        return UNCONFIRMED
+    if w.score < _final_score(d):
+        return "less likely than the result"
+    if keys & standouts(d.physics.get(w.fitted.hypothesis.keys, {})):
+        return "fits better, but not surely enough for a name"
+    return "does not stand out of the misfit that it leaves"
+
+
+def _final_score(d: Diagnosis) -> float:
+    return next(w.score for w in d.searched.tried if w.fitted.hypothesis.keys == d.final.hypothesis.keys)
 
 
 def _plain(value: Any) -> Any:
