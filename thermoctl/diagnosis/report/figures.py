@@ -147,7 +147,9 @@ def with_interval(value: float, sd: float | None, unit: str | None = None) -> st
 def short(parameter: str, finding: Result) -> str:
     """Return the name of a finding's parameter without its suffix of effect and place."""
     place = re.sub(r"[^A-Za-z0-9_]", "_", finding["where"])
-    return re.sub(f"_({finding['effect'].replace(' or ', '|')})_{place}$", "", parameter)
+    for member in finding.get("members", [finding]):
+        parameter = parameter.removesuffix(f"_{member['effect']}_{place}")
+    return parameter
 
 
 def equation(finding: Result) -> str:
