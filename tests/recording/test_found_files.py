@@ -520,3 +520,27 @@ def test_columns_of_a_fixed_width_are_refused_with_a_remedy(tmp_path):
     text = rows(" 12839 MIAMI FL -5 N 25 48", *(f" 620101{h:02d}00000000?0000?0" for h in range(1, 9)))
     with pytest.raises(InputError, match="run.csv:1: .*fixed width: write them with commas"):
         read(tmp_path, text)
+
+
+def _mat(folder, **content):
+    scipy.io.savemat(folder / "run.mat", content)
+    return folder / "run.mat"
+
+
+def test_a_stated_interval_that_the_recorded_times_leave(tmp_path):
+    """Loop times of a script: two rows at the start, then 2.1 s on the average, beside `ts = 2`."""
+    t = np.r_[0, 0, 2.1 * np.arange(1, 99)]
+    path = _mat(tmp_path, ts=2.0, t=t, u=np.sin(t))
+    with pytest.raises(
+        InputError, match=r"states 2 s a row; .*'t' differ by up to 7\.8 s; say --time 't', or --time 2s"
+    ):
+        read_recording(path)
+    assert read_recording(path, time="2s").t[-1] == 198.0
+    assert read_recording(path, time="t", equal_times="last").t[-1] == t[-1]
+
+
+def test_a_stated_interval_beside_rounded_or_other_times(tmp_path):
+    rounded = read_recording(_mat(tmp_path, ts=0.4, t=np.floor(0.4 * np.arange(20)), u=np.arange(20.0)))
+    assert rounded.t[1] == 0.4 and any("states 0.4 s a row; its times in 't'" in n for n in rounded.notes)
+    uneven = read_recording(_mat(tmp_path, ts=2.0, t=0.1 * np.arange(20), u=np.ones(20)))
+    assert uneven.t[1] == 0.1 and any("they are used" in n for n in uneven.notes)

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.clock import ClockError, Seconds
-from thermoctl.recording.foreign.names import COUNTED, NAMED, is_generic, named, unit_of_time
+from thermoctl.recording.foreign.names import COUNTED, NAMED, NO_NAME, is_generic, named, unit_of_time
 from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import known
 
@@ -36,6 +36,7 @@ STRICT, TIES, EVEN, FIRST, JOINED = 25, 5, 8, 4, 6
 NEEDED = 30  # least points of a clock
 # Least points of a clock that is used though another column holds wrong dates, or is named as another.
 SURE = 60
+UNLIKE = 0.05  # least relative difference of a stated interval and the recorded times to be a note
 COUNTER_NOTE = "a counter, for want of times"
 COUNTER = 1.0  # step of a column that counts rows
 _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
@@ -57,7 +58,6 @@ _FIELDS = {  # names of the parts of a date that have a column each
 # Orders and ranges of these parts in the first columns of a table without names, as weather files have them.
 _ORDERS = """year doy month day hour minute | year month day hour minute | year month day hour minute second
     | year doy hhmm | doy hhmm | year month day hour"""
-_NO_NAME = re.compile(r"column_\d+$")
 _RANGES = {"year": (1900, 2100), "month": (1, 12), "day": (1, 31), "doy": (1, 366), "hour": (0, 24)}
 _RANGES |= {"hhmm": (0, 2400), "minute": (0, 60), "second": (0, 60)}
 
@@ -271,7 +271,7 @@ def _joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[Clock]:
 
 def _of_first_columns(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
     """Return a clock of first columns without names, if they are parts of a date that runs evenly."""
-    names = list(filter(_NO_NAME.match, sheet.columns))
+    names = list(filter(NO_NAME.match, sheet.columns))
     for order in map(str.split, _ORDERS.split("|")):
         at = dict(zip(order, names, strict=False))
         if len(at) == len(order) and all(_within(sheet.columns[n], *_RANGES[key]) for key, n in at.items()):
@@ -326,7 +326,7 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
         digits = hours[np.isfinite(hours)] if hours.dtype.kind == "f" else np.zeros(0)
         plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
         hourly = of_day.strip().lower() in _FIELDS["hour"]
-        unnamed = _NO_NAME.match(of_day) and _NO_NAME.match(date) and np.any(np.diff(read[date].t) == 0)
+        unnamed = NO_NAME.match(of_day) and NO_NAME.match(date) and np.any(np.diff(read[date].t) == 0)
         if not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):  # noqa: PLR2004
             return None
         long = digits.max() > 2359 or "hhmmss" in of_day.lower()  # noqa: PLR2004
@@ -344,7 +344,7 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
             days = pc.replace_substring_regex(days, r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3")
     try:
         joined = clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
-        if _NO_NAME.match(of_day) and "evenly" not in _run(joined.t)[1]:
+        if NO_NAME.match(of_day) and "evenly" not in _run(joined.t)[1]:
             return None
         return replace(joined, note=joined.note + said)
     except (ClockError, pa.ArrowInvalid):
@@ -412,6 +412,7 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
     if not good:
         raise LookupError("; ".join(f"'{'+'.join(c.columns)}' {c.why}" for c in ranked[:4]))
     best = next((c for c in good[1:] if not good[0].columns and _says_it(c, good[0])), good[0])
+    sheet.notes += _disagreement(best, good)
     others = _rivals(sheet, best, good[1:])
     best = best if others else _finest(best, good)
     names = list(sheet.columns)
@@ -435,6 +436,33 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
         mine = names[begins[k] : begins[k + 1]] + (names[: begins[0]] if k == 0 else [])
         chosen.append((c, [n for n in mine if n not in c.columns]))
     return chosen
+
+
+def _surely_timed(clock: Clock) -> bool:
+    """Return whether a column holds times by its name or its cells, and they never run backwards."""
+    named_so = clock.seconds.kind != "bare" or any(named(c) > 0 for c in clock.columns)
+    steps = np.diff(clock.seconds.t)
+    return bool(clock.columns) and named_so and len(steps) > 0 and not (steps < 0).any()
+
+
+def _disagreement(best: Clock, good: list[Clock]) -> list[str]:
+    """Return a note where the interval that a file states is not that of its recorded times.
+
+    Raises ClockError where it would be used though the times drift away from it."""
+    stated = next((c for c in good if not c.columns), best)
+    timed = [c for c in (best, *good) if _surely_timed(c)]
+    if stated.columns or not timed:
+        return []
+    t, even = timed[0].seconds.t, stated.seconds.t[: len(timed[0].seconds.t)]
+    steps, step = np.diff(t), even[1] - even[0]
+    away = float(np.nanmax(np.abs((t - t[0]) - (even - even[0]))))
+    says = f"the file states {step:g} s a row; its times in {timed[0].where} differ by up to {away:.3g} s"
+    if best.columns:
+        return [says + "; they are used"] if abs(np.nanmedian(steps) - step) > UNLIKE * step else []
+    if away > 2 * max(step, float(np.nanmax(steps))):  # more than rounded times do
+        option = timed[0].columns[0].partition("\0")[0]
+        raise ClockError(0, f"{says}; say --time {option!r}, or --time {step:g}s for even rows")
+    return [says]
 
 
 def _says_it(clock: Clock, stated: Clock) -> bool:

@@ -13,6 +13,7 @@ _COUNTERS = WORDS["counters"].split()
 _OTHERS = WORDS["other_times"].split()
 MOST_WORDS = 3  # largest number of words in a counter's name
 _STEPS = ("step", "index", "number", "no", "nr", "count", "id", "idx")
+NO_NAME = re.compile(r"column_\d+$")  # column of a table without a header
 _PARTS = re.compile(r"[^\W\d_]+|#|n[°º]", re.UNICODE)
 
 
