@@ -544,3 +544,59 @@ def test_a_stated_interval_beside_rounded_or_other_times(tmp_path):
     assert rounded.t[1] == 0.4 and any("states 0.4 s a row; its times in 't'" in n for n in rounded.notes)
     uneven = read_recording(_mat(tmp_path, ts=2.0, t=0.1 * np.arange(20), u=np.ones(20)))
     assert uneven.t[1] == 0.1 and any("they are used" in n for n in uneven.notes)
+
+
+IN_TURN = [(f"10:00:{10 * k:02d}", k % 3 + 1, 20 + k) for k in range(6)]
+
+
+@pytest.mark.parametrize(
+    "head, row",
+    [
+        ("", "{} {}: {}"),
+        ("time channel value", "{} {} {}"),
+        ("time,sensor,value", "{},{},{}"),
+        ("Time;channel;Wert", "{};{}:;{}"),
+    ],
+)
+def test_channels_in_turn_are_columns(tmp_path, head, row):
+    """Each has times of its own; times of day count from the first row of the file, not of the channel."""
+    found = read(tmp_path, rows(*filter(None, [head]), *(row.format(*r) for r in IN_TURN)), "run.txt")
+    assert [n[-1] for n in found.columns] == ["1", "2", "3"] and found.t.tolist() == [0, 10, 20, 30, 40, 50]
+    for column, value in zip(found.columns.values(), (20, 21, 22), strict=True):
+        at = np.flatnonzero(np.isfinite(column)).tolist()
+        assert at == [value - 20, value - 17] and column[at].tolist() == [value, value + 3]
+
+
+def test_channels_in_turn_without_a_sign_are_named(tmp_path):
+    found = read(tmp_path, rows(*("{} {} {}".format(*r) for r in IN_TURN)), "run.txt")
+    assert any("1 to 3 again and again: channels in turn?" in n for n in found.notes)
+    counted = read(tmp_path, rows("time,point,value", *(f"{k},{k + 1},{k}" for k in range(6))))
+    assert list(counted.columns) == ["point", "value"]
+
+
+@pytest.mark.parametrize(
+    "content, names",
+    [
+        (
+            '{"rate": 50, "data": [{"kind": "drop", "of": ["b"], "u": [0, 1, 2], "y": [3, null, 5]}]}',
+            ["u", "y"],
+        ),
+        ('[{"t": 0, "a": [1, 2]}, {"t": 2, "a": [3, 4]}, {"t": 3, "a": [5, 6]}]', ["a_1", "a_2"]),
+        ('{"id": "x", "samples": [["t", "u"], [0, 1], [1, 4], [3, 5]]}', ["u"]),
+    ],
+)
+def test_lists_in_json(tmp_path, content, names):
+    how = {} if '"t"' in content else {"time": "1s"}
+    assert list(read(tmp_path, content, "run.json", **how).columns) == names
+
+
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        ('[{"t": [0, 1], "u": [0, 1]}, {"t": [0, 1], "u": [0, 1]}]', "2 objects of lists; one was expected"),
+        ('{"a": {"b": 1}}', r'no table in this JSON; records \[\{"t": 0'),
+    ],
+)
+def test_json_without_a_table(tmp_path, content, says):
+    with pytest.raises(InputError, match=says):
+        read(tmp_path, content, "run.json")

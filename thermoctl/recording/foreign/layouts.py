@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
+from thermoctl.recording.foreign.names import NO_NAME, named
 from thermoctl.recording.foreign.sheet import Sheet
 from thermoctl.recording.foreign.units import WORDS, spelled
 
@@ -33,6 +34,7 @@ _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
+MOST_ITEMS = 64  # largest number of items of a list that is one sample, such as an acceleration
 LEAD = 65536  # number of first bytes from which the layout is found
 _GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
 
@@ -53,6 +55,10 @@ def _sheet(
     return Sheet(dict(texts), place, name=name)
 
 
+def _item(path: Path) -> Callable[[int], str]:
+    return lambda row: f"{path}: item {row + 1}"
+
+
 def _word(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -65,13 +71,15 @@ def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
 
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's values; those of a record inside it are called `outer_inner`."""
+    """Return a record's values; those inside a value are called `outer_inner`, or `outer_1` in a list."""
     values: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, dict):
             values |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
         elif not isinstance(value, list):
             values[key] = value
+        elif len(value) <= MOST_ITEMS and all(isinstance(v, int | float) for v in value):
+            values |= {f"{key}_{i}": v for i, v in enumerate(value, 1)}
     return values
 
 
@@ -85,7 +93,12 @@ def _json(path: Path, text: str) -> list[Sheet] | None:
             if path.suffix.lower() == ".json":
                 raise InputError(f"{path}: no JSON: {e}") from None
             return None
-    return _of_json(path, content)
+    if sheets := _of_json(path, content):
+        return sheets
+    raise InputError(
+        f'{path}: no table in this JSON; records [{{"t": 0, "T": 20}}, ...], columns {{"t": [0, 1], "T": [20, 21]}} '
+        'or rows [["t", "T"], [0, 20], ...] were expected'
+    )
 
 
 def _of_json(path: Path, content: Any) -> list[Sheet] | None:
@@ -97,24 +110,55 @@ def _of_json(path: Path, content: Any) -> list[Sheet] | None:
     for reader in (_thingspeak, _series, _temperature_store):
         if sheets := reader(path, content):
             return sheets
-    vectors = {
-        k: v for k, v in content.items() if isinstance(v, list) and v and not isinstance(v[0], dict | list)
-    }
-    if len(vectors) > 1 and len({len(v) for v in vectors.values()}) == 1:
-        return [_sheet(path, vectors, lambda row: f"{path}: item {row + 1}")]
+    if sheet := _lists(path, content):
+        return [sheet]
     inner = [f for v in content.values() if isinstance(v, dict | list) and (f := _of_json(path, v))]
     if not inner:
         inner = [f for v in content.values() if isinstance(v, list) for x in v if (f := _of_json(path, x))]
     return [s for f in inner for s in f] or None
 
 
+def _lists(path: Path, content: Mapping[str, Any]) -> Sheet | None:
+    """Return the lists of one length in an object as columns; the longest, if they are two or more."""
+    lists = {
+        k: v for k, v in content.items() if isinstance(v, list) and v and not isinstance(v[0], dict | list)
+    }
+    lengths = [len(v) for v in lists.values()]
+    rows = max((n for n in lengths if lengths.count(n) > 1), default=0)
+    if not rows:
+        return None
+    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, _item(path))
+    sheet.notes += [
+        f"list '{k}' left out: {len(v)} items; the others have {rows}"
+        for k, v in lists.items()
+        if len(v) != rows
+    ]
+    return sheet
+
+
 def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
     if content and all(isinstance(x, dict) for x in content):
-        series = [s for x in content for s in _series(path, x) or ()]
-        return series or [_records(path, content)]
+        if series := [s for x in content for s in _series(path, x) or ()]:
+            return series
+        tables = [s for x in content if (s := _lists(path, x))]
+        if len(tables) == 1 == len(content):
+            return tables
+        if len(tables) == len(content) and not any(
+            named(k) > 0 for x in content for k, v in x.items() if not isinstance(v, list)
+        ):
+            raise InputError(
+                f"{path}: {len(tables)} objects of lists; one was expected: write a file of each"
+            )
+        return [_records(path, content)]
     lists = all(isinstance(x, list) and x and all(isinstance(y, dict) for y in x) for x in content)
     if content and lists:  # Home Assistant: a list for each entity
         return [_records(path, [{**_identity(x[0]), **y} for x in content for y in x])]
+    if len(content) > 1 and all(isinstance(x, list) for x in content):
+        rows = content[1:] if all(isinstance(n, str) for n in content[0]) else content
+        names = content[0] if rows is not content else [f"column_{i + 1}" for i in range(len(rows[0]))]
+        plain = not any(isinstance(y, dict | list) for x in rows for y in x)
+        if plain and {len(x) for x in rows} == {len(set(names))} != {1}:
+            return [_sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), _item(path))]
     return None
 
 
@@ -158,9 +202,7 @@ def _temperature_store(path: Path, content: Mapping[str, Any]) -> list[Sheet] | 
     if not columns:
         return None
     rows = min(len(c) for c in columns.values())
-    sheet = _sheet(
-        path, {n: c[len(c) - rows :] for n, c in columns.items()}, lambda row: f"{path}: item {row + 1}"
-    )
+    sheet = _sheet(path, {n: c[len(c) - rows :] for n, c in columns.items()}, _item(path))
     sheet.units = {n: "degC" for n in columns if not n.endswith("_power")}
     sheet.step_s = 1.0
     return [sheet]
@@ -288,16 +330,15 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
     identity = next((lower[k] for k in IDS if k in lower), None)
     value = next((lower[k] for k in VALUES if k in lower), None)
-    if (
-        identity is None
-        or value is None
-        or identity == value
-        or isinstance(sheet.columns[identity], np.ndarray)
-    ):
+    if identity is None and value is None:
+        identity, value = _labelled_columns(sheet)
+    if identity is None or value is None or identity == value:
         return None
-    ids = pc.fill_null(sheet.columns[identity], "")
+    ids = _signals(identity, sheet.columns[identity])
+    if ids is None:
+        return None
     rest = {n: c for n, c in sheet.columns.items() if n not in (identity, value)}
-    times = {n: c for n, c in rest.items() if _is_clock(c)}
+    times = {n: c for n, c in rest.items() if _is_clock(c) or (named(n) > 0 and isinstance(c, np.ndarray))}
     tags = [
         n
         for n, c in rest.items()
@@ -305,6 +346,8 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     ]
     if not times:
         return None
+    if len(times) == 1:
+        times = {n: _of_one_day(c, sheet.notes) for n, c in times.items()}
     if tags and identity.startswith("_"):
         ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
     sheets = []
@@ -323,7 +366,63 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
                 decimal=sheet.decimal,
             )
         )
+    if sheets:
+        sheets[0].notes += sheet.notes
     return sheets or None
+
+
+def _of_one_day(cells: Any, notes: list[str]) -> Any:
+    """Return times of day, which have no date, as durations from the first of all signals."""
+    if isinstance(cells, np.ndarray):
+        return cells
+    seconds = clock.from_texts(cells)
+    if seconds.kind != "time of day":
+        return cells
+    notes.append(seconds.note)
+    return np.round(seconds.t * 1e9).astype("timedelta64[ns]")
+
+
+def _labelled_columns(sheet: Sheet) -> tuple[str | None, str | None]:
+    """Return the columns of labels and values of rows `00:42:14 2: 91.1`; note numbers that may be labels."""
+    if len(names := list(sheet.columns)) != 3 or not all(map(NO_NAME.match, names)):  # noqa: PLR2004
+        return None, None
+    cells = sheet.columns[names[1]]
+    texts = cells if not isinstance(cells, np.ndarray) else pa.array([], pa.string())
+    seen = len(pc.unique(texts))
+    if 1 < seen <= len(texts) / 2 and pc.all(pc.match_substring_regex(texts, r"^.*\w[:=]$")).as_py():
+        return names[1], names[2]
+    numbers = _numbers(cells)
+    high = numbers.max(initial=0)
+    in_turn = 1 < high <= len(numbers) / 2 and np.array_equal(numbers, np.arange(len(numbers)) % high + 1)
+    if in_turn and _is_clock(sheet.columns[names[0]]):
+        sheet.notes.append(
+            f"{names[1]} runs from 1 to {high:g} again and again: channels in turn? A header line "
+            "`time channel value` makes a column of each"
+        )
+    return None, None
+
+
+def _numbers(cells: Any) -> np.ndarray:
+    """Return a column as numbers; none where a cell is no plain number."""
+    if isinstance(cells, np.ndarray):
+        return cells if cells.dtype.kind == "f" and np.isfinite(cells).all() else np.zeros(0)
+    if not len(cells) or not pc.all(pc.match_substring_regex(cells, r"^\d{1,9}$")).as_py():
+        return np.zeros(0)
+    return np.asarray(cells.cast(pa.float64()).to_numpy(zero_copy_only=False))
+
+
+def _signals(name: str, cells: Any) -> pa.Array | None:
+    """Return names of signals; of numbered ones `channel_2`. None where numbers count rows."""
+    texts = cells
+    if len(numbers := _numbers(cells)):
+        texts = pa.array([f"{v:.0f}" for v in numbers.tolist()])
+        if np.any(numbers % 1) or not 1 < len(pc.unique(texts)) <= len(numbers) / 2:
+            return None
+    elif isinstance(cells, np.ndarray):
+        return None
+    texts = pc.replace_substring_regex(pc.fill_null(texts, ""), r"\s*[:=]$", "")
+    prefix = "channel" if NO_NAME.match(name) else name.strip()
+    return pc.replace_substring_regex(texts, r"^(\d+)$", rf"{prefix}_\1")
 
 
 def _places(place: Callable[[int], str], rows: np.ndarray) -> Callable[[int], str]:
