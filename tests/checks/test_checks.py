@@ -1,12 +1,14 @@
 """Damaged and mislabelled recordings are found before any refit; sound ones, also with missing physics, are not."""
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
 
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
+from thermoctl.checks.commands import report
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -316,6 +318,17 @@ def test_a_measured_ramp_that_the_plant_holds_by_default():
     (found,) = checks(plant, [table])
     assert (found.kind, found.severe) == ("between", False) and "'power'" in found.what
     assert "between_samples" in found.suggestion
+
+
+def test_a_word_that_the_plant_file_lacks_is_asked_for_once():
+    """The movement differs in each recording, the line to write does not."""
+    plant, table = ramps("column: power")
+    faster = dataclasses.replace(
+        table, path="faster.csv", columns=table.columns | {"power": table.columns["power"] ** 2}
+    )
+    report(checks(plant, [table, faster]), out := io.StringIO())
+    (line,) = [x for x in out.getvalue().splitlines() if "between_samples" in x]
+    assert "times their noise (in 2 recordings)" in line
 
 
 @pytest.mark.parametrize("said", ["between_samples: linear", "between_samples: hold"])
