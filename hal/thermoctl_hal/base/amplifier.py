@@ -159,6 +159,15 @@ class Commanded:
                 self.send_message(message, command)
         super().disconnect()  # type: ignore[misc]
 
+    def switch_off(self: Any) -> None:
+        """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
+        self.connect()
+        sample = Sample(len(self.binding.channels.names))
+        try:
+            self.confirm_off(lambda: self.poll(sample) if self.slow else self.read(sample, time.monotonic()))
+        finally:
+            super().disconnect()  # type: ignore[misc]
+
     def read(self: Any, sample: Sample, now_s: float) -> None:
         """Take what has arrived; an assumed state counts as just reported."""
         super().read(sample, now_s)  # type: ignore[misc]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
@@ -214,12 +213,3 @@ class DbcDrive(Commanded, DbcDevice):
             self._port.send_long(can_id, data)
         else:
             self._port.send((can_id, data))
-
-    def switch_off(self) -> None:
-        """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
-        self.connect()
-        sample = Sample(len(self.binding.channels.names))
-        try:
-            self.confirm_off(lambda: self.read(sample, time.monotonic()))
-        finally:
-            super().disconnect()

@@ -353,15 +353,6 @@ class ModbusDrive(Commanded, ModbusDevice):
             name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
             raise HardwareError(f"{where}: exception {code} ({name}): {remedy}")
 
-    def switch_off(self) -> None:
-        """Disable over a link of its own. Raises HardwareError when the amplifier does not confirm."""
-        self.connect()
-        sample = Sample(len(self.binding.channels.names))
-        try:
-            self.confirm_off(lambda: self.poll(sample))
-        finally:
-            ModbusDevice.disconnect(self)
-
 
 def encode(value: float, register: Register) -> list[int]:
     """Return the words (or the bit) of a number, in the order of the wire."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-import time
 
 from thermoctl_hal.base.amplifier import Commanded
-from thermoctl_hal.base.backend import HardwareError, Sample
+from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.message import serial_bytes
 from thermoctl_hal.base.profile import Message
 from thermoctl_hal.serial.port import SerialDevice
@@ -27,12 +26,3 @@ class SerialDrive(Commanded, SerialDevice):
             written = 0
         if written < len(data):
             raise OSError(errno.ENOBUFS, "the line takes no data: is command_hz too high for its baud rate?")
-
-    def switch_off(self) -> None:
-        """Disable over a link of its own. Raises HardwareError when it is not confirmed, OSError."""
-        self.connect()
-        sample = Sample(len(self.binding.channels.names))
-        try:
-            self.confirm_off(lambda: self.read(sample, time.monotonic()))
-        finally:
-            SerialDevice.disconnect(self)

@@ -112,11 +112,11 @@ def _run(t: np.ndarray) -> tuple[int, str]:
     if (steps < 0).all():
         return TIES, "decreases"
     back = np.mean(steps < 0)
-    if back > 0.02 and np.sum(steps < 0) > 1 or not (steps > 0).any():  # noqa: PLR2004
+    if back > 0.02 and np.sum(steps < 0) > 1 or not (steps > 0).any():
         return FOREIGN, "does not increase"
     if not (steps > 0).all():
         return TIES, "increases, with equal or earlier times"
-    even = np.median(np.abs(steps - np.median(steps))) <= 0.02 * np.median(steps)  # noqa: PLR2004
+    even = np.median(np.abs(steps - np.median(steps))) <= 0.02 * np.median(steps)
     return STRICT + (EVEN if even else 0), "increases evenly" if even else "increases"
 
 
@@ -158,7 +158,7 @@ def _exact(cells: pa.Array) -> Seconds:
 
 def _digits(values: np.ndarray) -> list[str] | None:
     """Return numbers such as 20260301105957 as texts, if all of them are compact dates."""
-    if values.min() < 19_000_101 or np.any(values != np.round(values)):  # noqa: PLR2004
+    if values.min() < 19_000_101 or np.any(values != np.round(values)):
         return None
     low, high = values.min(), values.max()
     for size in (1, 100, 10_000, 1_000_000):
@@ -306,7 +306,7 @@ def _of_parts(sheet: Sheet, at: dict[str, str]) -> tuple[tuple[str, ...], Second
         if "hhmm" in at
         else (whole["hour"], whole.get("minute", 0))
     )
-    if np.all(minute == 60):  # hours that are named by their end (EnergyPlus)  # noqa: PLR2004
+    if np.all(minute == 60):  # hours that are named by their end (EnergyPlus)
         minute = 0
     t = days * 86_400.0 + hour * 3600.0 + minute * 60.0 + columns.get("second", 0.0)
     start = str(np.datetime64(round(float(t[0]) * 1e3), "ms"))
@@ -327,10 +327,10 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
         plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
         hourly = of_day.strip().lower() in _FIELDS["hour"]
         unnamed = NO_NAME.match(of_day) and NO_NAME.match(date) and np.any(np.diff(read[date].t) == 0)
-        if not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):  # noqa: PLR2004
+        if not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):
             return None
-        long = digits.max() > 2359 or "hhmmss" in of_day.lower()  # noqa: PLR2004
-        if digits.max() <= 24 and "hhmm" not in of_day.lower():  # noqa: PLR2004
+        long = digits.max() > 2359 or "hhmmss" in of_day.lower()
+        if digits.max() <= 24 and "hhmm" not in of_day.lower():
             digits, long, said = digits * 10_000, True, " and hours of the day"
         hours = pa.array([f"{v:06.0f}" if long else f"{v:04.0f}00" for v in digits.tolist()])
         hours = pc.replace_substring_regex(hours, r"^(\d\d)(\d\d)(\d\d)$", r"\1:\2:\3")
@@ -380,7 +380,7 @@ def _spread(steps: np.ndarray) -> float:
 
 def _finest(best: Clock, good: list[Clock]) -> Clock:
     """Return the finest of the clocks that show the same times; it keeps the date of the best one."""
-    if best.counter or not best.columns or len(good) < 2:  # noqa: PLR2004
+    if best.counter or not best.columns or len(good) < 2:
         return best
     t, size = best.seconds.t - best.seconds.t[0], clock.grain(best.seconds.t)
     same = [

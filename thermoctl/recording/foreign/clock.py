@@ -123,8 +123,8 @@ def of_one_year(seconds: Seconds) -> Seconds:
     usual = float(np.median(steps)) if len(steps) else 0.0
     years = np.round((steps - usual) / YEAR_S)
     jumps = (years != 0) & (np.abs(steps - usual - years * YEAR_S) < 2 * DAY_S)  # a 29th of February
-    even = usual > 0 and np.all(np.abs(steps[~jumps] - usual) <= 1e-6 * usual)  # noqa: PLR2004
-    if not even or not 0 < np.sum(jumps) < 12 or (steps > 0).all():  # noqa: PLR2004
+    even = usual > 0 and np.all(np.abs(steps[~jumps] - usual) <= 1e-6 * usual)
+    if not even or not 0 < np.sum(jumps) < 12 or (steps > 0).all():
         return seconds
     t = np.concatenate([seconds.t[:1], seconds.t[0] + np.cumsum(np.where(jumps, usual, steps))])
     return replace(seconds, t=t, note=f"{seconds.note}; months of several years put together as one year")
@@ -135,16 +135,16 @@ def grain(t: np.ndarray) -> float:
     t = t[np.isfinite(t)]
     since = t - t[:1]
     sizes = (60.0, *(10.0**-k for k in range(7)))
-    return next((g for g in sizes if np.all(np.abs(since / g - np.round(since / g)) < 1e-3)), 0.0)  # noqa: PLR2004
+    return next((g for g in sizes if np.all(np.abs(since / g - np.round(since / g)) < 1e-3)), 0.0)
 
 
 def rounding(t: np.ndarray) -> str:
     """Return a note where the steps of the times (N,) differ as rounding makes even ones differ."""
     steps = np.diff(t[np.isfinite(t)])
-    if len(steps) < 2 or not 0 < np.ptp(steps) <= 1.001 * np.median(steps):  # noqa: PLR2004
+    if len(steps) < 2 or not 0 < np.ptp(steps) <= 1.001 * np.median(steps):
         return ""
     size = grain(t)
-    if abs(np.ptp(steps) - size) > 0.001 * size:  # noqa: PLR2004
+    if abs(np.ptp(steps) - size) > 0.001 * size:
         return ""
     return f"the times are whole multiples of {size:g} s and {steps.min():g} or {steps.max():g} s apart: rounded?"
 
@@ -161,7 +161,7 @@ def tidied(texts: pa.Array) -> pa.Array:
 def is_time(cell: str) -> bool:
     """Return whether a cell is a date, a time of day, both, or a duration of days and a time."""
     text = cell.strip(" \t\"'\u00a0")
-    if not _MAYBE.search(text) or len(text) > 64:  # noqa: PLR2004
+    if not _MAYBE.search(text) or len(text) > 64:
         return False
     for pattern, by in _ONE_SPELLINGS:
         text = pattern.sub(by, text)
@@ -212,7 +212,7 @@ def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Se
 def _of_days(days: np.ndarray) -> np.ndarray:
     """Return days (N,) without their rounding: of 44512.66008, to 0.864 s, the whole second."""
     for size, whole_s in ((1e-4, 10.0), (1e-5, 1.0), (1e-6, 0.1)):
-        if np.nanmax(np.abs(days / size - np.round(days / size))) < 1e-3:  # noqa: PLR2004
+        if np.nanmax(np.abs(days / size - np.round(days / size))) < 1e-3:
             return np.round(days * DAY_S / whole_s) * whole_s / DAY_S
     return days
 
@@ -261,7 +261,7 @@ def from_texts(texts: pa.Array) -> Seconds:
     clock = _clock_ns(field)
     dated = pc.not_equal(field["a"], "").to_numpy(zero_copy_only=False)
     if not dated.any():
-        if _whole(field["h"]).max() > 24:  # noqa: PLR2004
+        if _whole(field["h"]).max() > 24:
             return Seconds(clock / 1e9, None, "durations read as hours, minutes and seconds", "duration")
         days = np.concatenate([[0], np.cumsum(np.diff(clock) < -DAY_NS // 2)])
         ns = clock + days * DAY_NS
@@ -325,7 +325,7 @@ def _clock_ns(field: dict[str, pa.Array]) -> np.ndarray:
     hour, minute, second = (_whole(field[k]) for k in "hms")
     half = pc.utf8_lower(field["p"]).to_numpy(zero_copy_only=False)
     dated = pc.not_equal(field["a"], "").to_numpy(zero_copy_only=False)
-    wrong = ((hour > 24) & (dated | (half != ""))) | (minute > 59) | (second > 60)  # noqa: PLR2004
+    wrong = ((hour > 24) & (dated | (half != ""))) | (minute > 59) | (second > 60)
     if wrong.any():
         raise ClockError(int(wrong.argmax()), "a time of day beyond 24:59:60")
     if (half != "").any():
@@ -363,12 +363,12 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray, points: bool) -> tuple
             )
         middle = pc.if_else(pc.equal(middle, text), str(month), middle)
     a, b, c = _whole(field["a"]), _whole(middle), _whole(field["c"])
-    if a.max() > 31 or len(field["a"][0].as_py()) == 4:  # noqa: PLR2004
+    if a.max() > 31 or len(field["a"][0].as_py()) == 4:
         orders = {"year-month-day": (a, b, c)}
     else:
-        year = np.where(c < 100, c + 2000, c)  # noqa: PLR2004
+        year = np.where(c < 100, c + 2000, c)
         orders = {"day.month.year": (year, b, a), "month/day/year": (year, a, b)}
-        if len(field["c"][0].as_py()) == 2:  # noqa: PLR2004
+        if len(field["c"][0].as_py()) == 2:
             orders["year/month/day"] = (a + 2000, b, c)
         if named:
             orders = {"day.month.year": (year, b, a)}
@@ -412,7 +412,7 @@ def _one_order(possible: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.n
 def _valid(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> bool:
     if not (
         month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31 and year.min() >= 1
-    ):  # noqa: PLR2004
+    ):
         return False
     months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
     length = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)

@@ -184,7 +184,7 @@ def _separator(
     """Return the separator that gives lines of one width and most numbers."""
     best: tuple[float, str, list[tuple[int, list[str]]]] | None = None
     for separator in candidates:
-        if not separator.strip(" ") and best is not None and best[0] >= 0.3:  # noqa: PLR2004
+        if not separator.strip(" ") and best is not None and best[0] >= 0.3:
             break  # blanks inside the cells: another separator was found already
         try:
             rows = [(n, cells_of(line, separator)) for n, line in sample]
@@ -192,7 +192,7 @@ def _separator(
             continue
         tail = [c for _, c in _tail(rows)]
         width, lines_of = Counter(len(c) for c in tail).most_common(1)[0]
-        if width < 2 or (separator == "," and len(rows[0][1]) == 1 and _all_commas(sample)):  # noqa: PLR2004
+        if width < 2 or (separator == "," and len(rows[0][1]) == 1 and _all_commas(sample)):
             continue
         if separator == "  " and any(_TWO.match(x) for c in tail for x in c):
             continue
@@ -206,7 +206,7 @@ def _separator(
     alone = [(n, [line.strip()]) for n, line in sample]
     if best is None and all(_kind(c[0]) in "n-" for _, c in _tail(alone)):
         return "\t", alone
-    if best is None or best[0] < 0.3:  # noqa: PLR2004
+    if best is None or best[0] < 0.3:
         shown = sample[0][1][:60]
         raise InputError(
             f"{path}:{sample[0][0]}: '{shown}': no columns; a header line and rows separated by comma, "
@@ -318,7 +318,7 @@ def _header(
         empty = {i for i in range(width) if data and not any(row[i] for row in data)}
         names = [f"\0{i}" if i in empty else f"column_{i + 1}" for i in range(width)]
         return tuple(names), aligned(facts, names, {}), (), set()
-    if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):  # noqa: PLR2004
+    if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):
         lines_of.pop()  # the line below the units (Origin)
     below: list[tuple[int, list[str]]] = []
     while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
@@ -357,7 +357,7 @@ def _header_lines(
     fitting = [(n, c) for n, c in head if _fits(c, width, data)]
     lines_of = ([f for f in fitting if len(f[1]) > 1] or fitting)[-HEAD_LINES:]  # a lone word is a title
     parted = bool(lines_of) and lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1
-    stated = [c for _, c in fitting if len(list(filter(None, c))) == 2 and is_number(c[1])]  # noqa: PLR2004
+    stated = [c for _, c in fitting if len(list(filter(None, c))) == 2 and is_number(c[1])]
     if parted and len(stated) > 1:
         lines_of = []  # statements such as `Sampling Period,4e-7`, and a title above the rows (GW Instek)
     if not lines_of or parted:
@@ -383,7 +383,7 @@ def _paired(
     pairs = {
         c[0].lower(): (n, c) for n, c in head if len(c) == width and width % 2 == 0 and len(set(c[::2])) == 1
     }
-    if "name" not in pairs or len(data) < 2:  # noqa: PLR2004
+    if "name" not in pairs or len(data) < 2:
         return None
     names, units = [], {}
     for i, name in enumerate(pairs["name"][1][1::2]):
@@ -402,7 +402,7 @@ def _fits(cells: list[str], width: int, data: list[list[str]]) -> bool:
     filled = len(cells)
     while filled and not cells[filled - 1]:
         filled -= 1
-    if filled < 2 and width > 2:  # noqa: PLR2004
+    if filled < 2 and width > 2:
         return False
     if 2 * sum(bool(_DECIMALS.match(c)) for c in cells) > filled:
         return False  # a row of values above the table (EnergyPlus)

@@ -28,7 +28,7 @@ def facts_of(above: list[tuple[int, str]], separator: str) -> dict[str, list[str
     for _, line in above:
         line = line.rstrip(f" {sep}")
         cells = [c.strip().strip('"') for c in line.split(sep)]
-        if len(cells) < 2 and (match := re.match(r"([^:=]{2,40})[:=]\s*(.+)$", line)):  # noqa: PLR2004
+        if len(cells) < 2 and (match := re.match(r"([^:=]{2,40})[:=]\s*(.+)$", line)):
             cells = [match[1].strip(), match[2].strip()]
         elif len(cells) > 1 and cells[0].endswith((":", "=")):
             cells[0] = cells[0][:-1].strip()

@@ -264,7 +264,7 @@ def _of_arrays(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
     """Return vectors and matrices of one length as tables; a matrix has its longer side as rows."""
     sheets = []
     for size in {max(v.shape) for v in loose.values()}:
-        own = {n: v for n, v in loose.items() if max(v.shape) == size and v.ndim <= 2}  # noqa: PLR2004
+        own = {n: v for n, v in loose.items() if max(v.shape) == size and v.ndim <= 2}
         columns: dict[str, Cells] = {}
         for name, v in own.items():
             if v.ndim == 1:

@@ -25,7 +25,7 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
     def add(place: str, item: Any) -> None:
         """Put a dataset into the table of its group; those of another length are another table."""
         above, _, name = place.rpartition("/")
-        if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2) or len(item) < 2:  # noqa: PLR2004
+        if not isinstance(item, h5py.Dataset) or item.ndim not in (1, 2) or len(item) < 2:
             return
         if re.fullmatch(r"axis0|block\d+_items", name) or "_i_" in place:  # names of a data frame; an index
             return
@@ -74,7 +74,7 @@ def _columns(name: str, item: Any) -> dict[str, Cells]:
             rest = {n: v for n, v in fields.items() if n != "index"}
             fields = {own: _dated(fields["index"], kind, "\nVtz\n" in info), **rest}
         titles = {n: _pickled(said.get(f"{n}_kind", "")) for n in fields}
-        return {k: c for n, v in fields.items() if v.ndim < 3 for k, c in _split(n, v, titles[n]).items()}  # noqa: PLR2004
+        return {k: c for n, v in fields.items() if v.ndim < 3 for k, c in _split(n, v, titles[n]).items()}
     if name in ("axis1", "index") and "kind" in said:
         values = _dated(values, _text(said["kind"]), "tz" in said)
         name = _text(said["name"]) if "name" in said and said["name"] != _NONE else "index"

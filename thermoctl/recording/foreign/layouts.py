@@ -269,7 +269,7 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
 def _klipper(path: Path, text: str) -> list[Sheet] | None:
     """Read the lines `Stats 123.4: heater_bed: target=60 temp=59.9 pwm=0.4 ...` of Klipper's log."""
     lines = list(_STATS.finditer(text))
-    if len(lines) < 2:  # noqa: PLR2004
+    if len(lines) < 2:
         return None
     records = []
     for match in lines:
@@ -303,7 +303,7 @@ def _labelled(path: Path, text: str) -> list[Sheet] | None:
 def _tektronix(path: Path, text: str) -> list[Sheet] | None:
     """Read the table of a Tektronix TDS: key, value, empty, time, value in each line."""
     rows = [cells_of(x, ",") for x in text.splitlines() if x.strip()]
-    if any(len(r) < 5 for r in rows):  # noqa: PLR2004
+    if any(len(r) < 5 for r in rows):
         return None
     facts = {r[0].lower(): r[1] for r in rows if r[0]}
     name = facts.get("source", "CH1") or "CH1"
@@ -384,7 +384,7 @@ def _of_one_day(cells: Any, notes: list[str]) -> Any:
 
 def _labelled_columns(sheet: Sheet) -> tuple[str | None, str | None]:
     """Return the columns of labels and values of rows `00:42:14 2: 91.1`; note numbers that may be labels."""
-    if len(names := list(sheet.columns)) != 3 or not all(map(NO_NAME.match, names)):  # noqa: PLR2004
+    if len(names := list(sheet.columns)) != 3 or not all(map(NO_NAME.match, names)):
         return None, None
     cells = sheet.columns[names[1]]
     texts = cells if not isinstance(cells, np.ndarray) else pa.array([], pa.string())

@@ -124,7 +124,7 @@ def _of_texts(
     share = float(np.mean(right))
     if share == 1.0:
         return pc.if_else(empty, "", tidy)
-    if share >= 0.5 and not all(cells.is_number(t) for t in filled.filter(pa.array(~right)).to_pylist()[:1]):  # noqa: PLR2004
+    if share >= 0.5 and not all(cells.is_number(t) for t in filled.filter(pa.array(~right)).to_pylist()[:1]):
         row = int(np.flatnonzero(~empty.to_numpy(zero_copy_only=False))[int(np.argmin(right))])
         raise CellError(
             row,
