@@ -169,6 +169,23 @@ def test_files_turn_over_by_size_and_age_and_the_oldest_go(tmp_path):
     writer.close()
 
 
+@pytest.mark.parametrize("right, wrong", [(1.8e9, 1.9e9), (1.8e9, 1e6)])
+def test_a_wrong_clock_costs_no_recording_of_today(tmp_path, right, wrong):
+    """Files of a clock that was ahead stayed for ever; each new file was deleted as the oldest instead."""
+    s = settings(tmp_path, budget_gb=2e-4, tier_budget_gb=1e-4)
+    wall, made = SimpleNamespace(now=wrong), []
+    for k in range(16):
+        wall.now = (right if k >= 8 else wrong) + 100 * k
+        writer = RecordingWriter(s, {}, wall=lambda: wall.now)
+        rows = ticks(500, 500 * k)
+        rows[:, INDEX["drive"]] = RNG.normal(size=500)
+        feed(writer, rows)
+        made.append(writer.path)
+        writer.close()
+    kept = [k for k, path in enumerate(made) if path.exists()]
+    assert kept == list(range(16 - len(kept), 16)) and 1 < len(kept) < 8
+
+
 def test_what_is_not_ours_is_never_deleted(tmp_path):
     for name in ("thesis.arrows", "rig-20260101T000000.000Z.csv"):
         (tmp_path / name).write_bytes(bytes(10_000))

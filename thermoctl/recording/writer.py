@@ -309,7 +309,7 @@ class RecordingWriter:
     def _open(self) -> None:
         rig, full, tier, wall = self._files_of
         now = datetime.fromtimestamp(wall(), UTC)
-        stamp = now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
+        self._stamp = stamp = now.strftime("%Y%m%dT%H%M%S.%f")[:-3] + "Z"
         begins = {"begins": now.isoformat(timespec="milliseconds")}
         full, tier = (s.with_metadata({**s.metadata, **begins}) for s in (full, tier))
         try:
@@ -325,18 +325,19 @@ class RecordingWriter:
                 raise FileExistsError(f"{self.directory}: a thousand files begin with {rig}-{stamp}")
             self._full_file = file
             self._tier_file = StreamFile(stem.with_name(stem.name + TIER), tier)
-            prune(self.directory, FULL, self.budget + file.bytes, self.path)
-            prune(self.directory, TIER, self.tier_budget + self._tier_file.bytes, self._tier_file.path)
+            self._prune(opening=True)
         except OSError as e:
             self._fail(e)
 
-    def _prune(self) -> None:
+    def _prune(self, opening: bool = False) -> None:
+        """Delete the oldest files; a margin is for the rows until the next check."""
         self._pruned_at = self._full_file.bytes if self._full_file else 0
-        slack = 1 - 1 / 32  # margin for the rows until the next check
-        prune(self.directory, FULL, self.budget * slack, self.path)
-        prune(
-            self.directory, TIER, self.tier_budget * slack, self._tier_file.path if self._tier_file else None
-        )
+        for file, kind, budget in (
+            (self._full_file, FULL, self.budget),
+            (self._tier_file, TIER, self.tier_budget),
+        ):
+            limit = budget + file.bytes if opening and file else budget * (1 - 1 / 32)
+            prune(self.directory, kind, limit, file.path if file else None, self._stamp)
 
     def _fail(self, e: OSError) -> None:
         self.error = f"{self.directory}: {reason(e)}; {remedy_of(e)}"
@@ -382,19 +383,19 @@ def recording_files(directory: Path, kind: str) -> list[Path]:
     return sorted(files, key=lambda p: (NAME.match(p.name)["start"], len(p.name), p.name))  # type: ignore[index]
 
 
-def prune(directory: Path, kind: str, budget: float, keep: Path | None, at_most: int | None = None) -> int:
-    """Delete the oldest files of a kind until they fit `budget` bytes (never `keep`, `at_most` so many).
+def prune(directory: Path, kind: str, budget: float, keep: Path | None, now: str) -> int:
+    """Delete the oldest files of a kind, but not `keep`, until they fit `budget` bytes; return how many.
 
-    How many."""
+    Files dated after `now`, in the form of their names, are older than it: the clock was wrong before."""
     sizes = {}
-    for p in recording_files(directory, kind):
+    for p in sorted(recording_files(directory, kind), key=lambda p: NAME.match(p.name)["start"] <= now):  # type: ignore[index]
         try:
             sizes[p] = p.stat().st_size
         except FileNotFoundError:
             continue
     total, gone = sum(sizes.values()), 0
     for p, size in sizes.items():
-        if total <= budget or gone == at_most:
+        if total <= budget:
             break
         if p != keep:
             p.unlink(missing_ok=True)
