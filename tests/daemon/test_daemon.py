@@ -17,6 +17,7 @@ from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon.control_socket import ask
+from thermoctl.daemon.lock import holder, lock_path
 from thermoctl.recording.reader import info
 
 
@@ -166,6 +167,21 @@ def test_a_second_daemon_is_refused(daemon, capsys):
     assert main(["run", "--config", str(daemon.config)]) == 2
     assert "another daemon runs" in capsys.readouterr().err
     assert daemon.ask("status")["ok"]
+
+
+def test_an_armed_daemon_whose_files_were_deleted_is_still_alone_and_obeys(daemon, capsys):
+    """A second one took over socket and segment; the first drove on, and no command reached it."""
+    daemon.ask("arm")
+    lock = lock_path(daemon.settings)
+    for path in (lock, Path(daemon.settings.socket.path)):
+        path.unlink()
+    assert main(["run", "--config", str(daemon.config)]) == 2
+    assert "another daemon holds this rig, and may drive it" in capsys.readouterr().err
+    lock.unlink(missing_ok=True)
+    wait(lambda: daemon.ask("status")["state"] == "ARMED", "a socket")
+    wait(lambda: holder(daemon.settings) == daemon.process.pid, "its lock")
+    assert "the command socket was deleted" in daemon.log
+    assert main(["stop", "--config", str(daemon.config)]) == 0 and daemon.process.wait(LIMIT_S) == 0
 
 
 @pytest.mark.parametrize("name", ["commands", "reference"])

@@ -74,9 +74,19 @@ def test_rows_from_another_process_are_whole_and_in_order(name):
         shared.remove()
 
 
+def _create_and_die(name):
+    Shared.create(name).counters[0] = 7.0
+    os._exit(1)
+
+
 def test_a_left_over_segment_is_replaced_and_a_foreign_one_refused(name):
     first = Shared.create(name)
-    first.counters[0] = 7.0
+    with pytest.raises(InputError, match="another daemon holds this rig, and may drive it"):
+        Shared.create(name)
+    first.remove()
+    killed = multiprocessing.get_context("fork").Process(target=_create_and_die, args=(name,))
+    killed.start()
+    killed.join()
     second = Shared.create(name)
     try:
         assert second.counters[0] == 0.0 and second.ring.head == 0

@@ -297,16 +297,26 @@ def listen(path: Path, group: str | None) -> socket.socket:
 
 
 def serve(listener: socket.socket, commands: Commands, stopping: Callable[[], bool]) -> None:
-    """Answer requests until `stopping()`; drop a client that sends too much."""
+    """Answer requests until `stopping()`; drop a client that sends too much.
+
+    A socket that was deleted is made again: without it no command would reach an armed rig."""
+    path = Path(listener.getsockname())
     selector = selectors.DefaultSelector()
     selector.register(listener, selectors.EVENT_READ)
     while not stopping():
+        if not path.exists():
+            selector.unregister(listener)
+            listener.close()
+            listener = listen(path, commands.started.socket.group)
+            selector.register(listener, selectors.EVENT_READ)
+            commands.log("the command socket was deleted: made again; let no program clean its folder")
         for key, events in selector.select(timeout=0.2):
             if key.fileobj is listener:
                 _accept(listener, selector)
             else:
                 _serve_client(key.data, events, selector, commands)
     selector.close()
+    listener.close()
 
 
 def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:

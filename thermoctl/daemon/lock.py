@@ -5,6 +5,7 @@ The lock ends with its last holder, for whatever reason; the file holds the hold
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import time
@@ -55,6 +56,19 @@ def hold(settings: Settings) -> int:
     os.ftruncate(file, 0)
     os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
     return file
+
+
+def is_retaken(settings: Settings, file: int) -> bool:
+    """Take the lock again, with the same open file, where someone deleted or replaced it in its folder.
+
+    Raises InputError where another process took it meanwhile."""
+    with contextlib.suppress(OSError):
+        if os.path.samestat(os.stat(lock_path(settings)), os.fstat(file)):
+            return False
+    again = hold(settings)
+    os.dup2(again, file, inheritable=False)
+    os.close(again)
+    return True
 
 
 def holder(settings: Settings) -> int | None:

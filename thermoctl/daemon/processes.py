@@ -153,7 +153,6 @@ def _command_process(settings: Settings, shared: Shared) -> int:
     try:
         serve(listener, Commands(shared, settings, reload_settings, console_log), stop)
     finally:
-        listener.close()
         with contextlib.suppress(FileNotFoundError):
             path.unlink()
     return EXIT_OK

@@ -29,7 +29,7 @@ from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.journal import Log, Watcher
-from thermoctl.daemon.lock import hold
+from thermoctl.daemon.lock import hold, is_retaken
 from thermoctl.daemon.processes import (
     EXIT_FAILED,
     EXIT_HARDWARE,
@@ -125,7 +125,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
             shared.append(Shared.create(shared_name(part), part.channels))
         bind(run=shared[0].run)
         board, loop, others = make_children(settings, shared)
-        return _Supervision(settings, shared, loop, others, log).run()
+        return _Supervision(settings, shared, loop, others, log, lock).run()
     finally:
         for s in shared:
             s.remove()
@@ -138,9 +138,9 @@ class _Supervision:
     """One run of the daemon: starts the processes and watches them until a signal or the loop's end."""
 
     def __init__(
-        self, settings: Settings, shared: list[Shared], loop: Child, others: list[Child], log: Log
+        self, settings: Settings, shared: list[Shared], loop: Child, others: list[Child], log: Log, lock: int
     ) -> None:
-        self.settings, self.loop, self.others, self.log = settings, loop, others, log
+        self.settings, self.loop, self.others, self.log, self.lock = settings, loop, others, log, lock
         self.axes = list(zip(settings.parts, shared, map(compensator, settings.parts), strict=True))
         self.shared = shared[0]
         self.asked: list[int] = []
@@ -209,6 +209,9 @@ class _Supervision:
         if now - self.kept_at > keep.EVERY_S:
             self.kept_at = now
             self._keep()
+            with contextlib.suppress(InputError):  # tried again
+                if is_retaken(self.settings, self.lock):
+                    self.log("the lock file was deleted: taken again; let no program clean its folder")
         if self.reload_asked and not self.reloading.alive:
             self.reload_asked.clear()
             self.reloading.start()

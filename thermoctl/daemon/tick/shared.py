@@ -18,6 +18,8 @@ daemon at any later time.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import mmap
 import os
@@ -148,7 +150,9 @@ class Shared:
 
     @classmethod
     def create(cls, name: str, channels: Channels = DEFAULT) -> Shared:
-        """Create the segment; one that a killed daemon left behind is removed first."""
+        """Create the segment and lock it; one that a killed daemon left behind is removed first.
+
+        Raises InputError where a daemon holds it: its lock beside the socket may have been deleted."""
         row, text = of_channels(channels), channels.text().encode()
         if len(text) > DECLARATION_BYTES:
             raise InputError(
@@ -157,8 +161,16 @@ class Shared:
         size = sum(int(np.prod(shape)) * 8 for _, _, shape in _areas(row))
         path = SHARED_MEMORY / name
         try:
+            with contextlib.suppress(FileNotFoundError), open(path, "rb") as left:
+                fcntl.flock(left, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink(missing_ok=True)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except BlockingIOError:
+            raise InputError(
+                f"shared memory '{name}': another daemon holds this rig, and may drive it, though its lock file was "
+                "deleted; end it with `thermoctl stop`"
+            ) from None
         except PermissionError:
             raise InputError(
                 f"shared memory '{name}': left by another user; remove {path}, or take another socket.path"
@@ -172,7 +184,7 @@ class Shared:
                 f"shared memory '{name}': {size} bytes are not to be had on {SHARED_MEMORY}: {e.strerror}; free some there"
             ) from None
         finally:
-            os.close(file)
+            os.close(file)  # the mapping holds a copy, and so the lock, in this process and its children
         shared.areas["declaration"].view("u1")[: len(text)] = np.frombuffer(text, "u1")
         shared.areas["header"][:] = MAGIC, VERSION, _layout(row), size
         shared.counters[RUN_S] = time.time()
