@@ -1,6 +1,7 @@
 """The daemon as a whole, its real processes on the simulated rig: commands, reload, and every way of dying."""
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -8,7 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
+from multiprocessing import Value
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -16,6 +19,7 @@ import pytest
 from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
 from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon import processes
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.lock import holder, lock_path
 from thermoctl.recording.reader import info
@@ -195,6 +199,33 @@ def test_a_helper_that_is_killed_comes_back_and_the_loop_runs_on(daemon, name):
     )
     now, _ = wait(lambda: daemon.ask("status"), "an answer")
     assert now["state"] == "ARMED" and now["ticks"] > ticks and daemon.process.poll() is None
+
+
+def test_a_helper_that_the_system_cannot_start_ends_nothing(monkeypatch):
+    """Without a free process the supervisor ended, and with it an armed rig; now it tries again."""
+    said, count = [], Value("i", 0)
+
+    def main(_):
+        count.value += 1
+        return 0
+
+    def log(event, **_):
+        said.append(event)
+
+    child = processes.Child("recorder", main, SimpleNamespace(axis=""))
+    child.start()
+    child.process.join()
+    with monkeypatch.context() as m:
+        m.setattr(
+            os, "fork", lambda: (_ for _ in ()).throw(BlockingIOError(errno.EAGAIN, "no process is left"))
+        )
+        for now in (1e3, 2e3, 3e3, 4e3):
+            processes.restart([child], child.started + now, log)
+    assert said.count("recorder cannot be started; the loop runs on") == 2 and count.value == 1
+    for now in (5e3, 6e3):
+        processes.restart([child], child.started + now, log)
+    child.process.join()
+    assert count.value == 2
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])

@@ -205,12 +205,12 @@ class Child:
         self.again_at, self.pause_s = 0.0, RESTART_S
 
     def start(self) -> None:
-        """Start the process."""
+        """Start the process. Raises OSError where the system has none left, or no memory."""
         self.process = _fork.Process(
             target=_run_child, args=(self.name, self.main, self.arguments), name=self.name
         )
-        self.process.start()
         self.started = self.heard_at = time.monotonic()
+        self.process.start()
 
     def hangs(self, now: float) -> bool:
         """Return whether the process runs without a completed round for HANG_S."""
@@ -268,7 +268,10 @@ def restart(children: list[Child], now: float, log: Log) -> None:
             child.pause_s = min(2.0 * child.pause_s, RESTART_LONGEST_S)
         elif now >= child.again_at:
             child.again_at = 0.0
-            child.start()
+            try:
+                child.start()
+            except OSError as e:
+                log(f"{child.name} cannot be started; the loop runs on", error=e)
 
 
 def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | None, Child, list[Child]]:

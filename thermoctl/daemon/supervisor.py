@@ -214,7 +214,10 @@ class _Supervision:
                     self.log("the lock file was deleted: taken again; let no program clean its folder")
         if self.reload_asked and not self.reloading.alive:
             self.reload_asked.clear()
-            self.reloading.start()
+            try:
+                self.reloading.start()
+            except OSError as e:
+                self.log("reload", error=e)
 
     def _look(self) -> None:
         for watcher in self.watchers:
