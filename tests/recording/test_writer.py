@@ -255,13 +255,26 @@ def test_a_recording_is_readable_from_its_first_moment_and_names_the_time(tmp_pa
     writer.close()
 
 
-def test_a_recording_that_was_deleted_is_not_written_on(tmp_path):
+def _replace(path):
+    path.with_suffix(".copy").write_bytes(path.read_bytes())
+    path.with_suffix(".copy").replace(path)
+
+
+@pytest.mark.parametrize(
+    "disturb", [os.unlink, _replace, lambda p: os.truncate(p, 2000)], ids=["gone", "other", "cut"]
+)
+def test_a_recording_that_another_program_changed_is_not_written_on(tmp_path, disturb):
+    """Ticks of an hour were lost without a word where a tool had put a copy in the file's place, or had cut it."""
     said = []
     writer = RecordingWriter(settings(tmp_path), {}, log=said.append)
     assert feed(writer, ticks(1002)) == 0 and said == [""]
-    writer.path.unlink()
-    assert feed(writer, ticks(1002, 1002)) > 0
-    assert writer.close() >= 0 and said[1].startswith(f"{tmp_path}: No such file or directory; ")
+    disturb(writer.path)
+    assert 0 < feed(writer, ticks(502, 1002)) <= 502
+    assert writer.full and "deleted, moved or changed; a new file begins" in said[1]
+    writer.close()
+    again = RecordingWriter(settings(tmp_path), {}, log=said.append)
+    assert feed(again, ticks(1002, 2000)) == 0 == again.close()
+    assert read_table(recording_files(tmp_path, FULL)[-1]).columns["tick"][0] == 2000
 
 
 def test_a_file_where_the_folder_belongs_is_no_full_disk(tmp_path):

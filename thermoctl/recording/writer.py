@@ -35,6 +35,7 @@ BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster
 TIER_HZ = 10.0
 TIER_BATCH_ROWS = 100  # 10 s; after a power loss the full rate still has these rows
 RETRY_S = 5.0
+CHANGED = "a new file begins; let other programs change only older ones"
 FULL, TIER = ".arrows", ".10hz.arrows"
 NAME = re.compile(r"^(?P<rig>.+)-(?P<start>\d{8}T\d{6}\.\d{3}Z)(?P<again>-\d+)?(?P<kind>\.10hz)?\.arrows$")
 _COMPRESSED = pa.ipc.IpcWriteOptions(compression="zstd")
@@ -94,6 +95,14 @@ class StreamFile:
             os.lseek(self._fd, self.bytes, os.SEEK_SET)
             raise
         self.bytes += len(data)
+
+    def is_intact(self) -> bool:
+        """Return whether the file is still at its path, with what was written. Raises OSError."""
+        try:
+            there, own = os.stat(self.path), os.fstat(self._fd)
+        except FileNotFoundError:
+            return False
+        return os.path.samestat(there, own) and own.st_size == self.bytes
 
     def close(self) -> None:
         """Write the end mark and release the file; one without rows is removed."""
@@ -266,11 +275,17 @@ class RecordingWriter:
             self.lost += len(rows)
             return
         try:
-            self._full_file.write(rows)
-            os.stat(self._full_file.path)  # raises where the file was deleted or its disk is gone
+            if intact := self._full_file.is_intact():
+                self._full_file.write(rows)
+                intact = self._full_file.is_intact()
         except OSError as e:
             self.lost += len(rows)
             self._fail(e)
+            return
+        if not intact:
+            self.lost += len(rows)
+            self._fail(OSError(f"{self._full_file.path.name} was deleted, moved or changed"), CHANGED)
+            self._failed -= RETRY_S  # nothing is wrong with the disk
             return
         try:
             self._tier_rows.append(self._tier.add(rows))
@@ -339,8 +354,8 @@ class RecordingWriter:
             limit = budget + file.bytes if opening and file else budget * (1 - 1 / 32)
             prune(self.directory, kind, limit, file.path if file else None, self._stamp)
 
-    def _fail(self, e: OSError) -> None:
-        self.error = f"{self.directory}: {reason(e)}; {remedy_of(e)}"
+    def _fail(self, e: OSError, remedy: str = "") -> None:
+        self.error = f"{self.directory}: {reason(e)}; {remedy or remedy_of(e)}"
         self._failed = self.clock()
         self.log(self.error)
         with contextlib.suppress(OSError):  # often the few bytes of the tier still fit
