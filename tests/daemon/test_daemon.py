@@ -228,6 +228,29 @@ def test_a_helper_that_the_system_cannot_start_ends_nothing(monkeypatch):
     assert count.value == 2
 
 
+def test_a_service_manager_that_reads_no_message_holds_nothing_up(unrecorded, tmp_path, monkeypatch):
+    """As systemd after a crash of its own: the supervisor waited for ever, and no signal ended the daemon."""
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+    manager.setblocking(False)
+    filler = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    filler.setblocking(False)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    daemon = Daemon(unrecorded)
+    try:
+        daemon.ask("arm")
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                filler.sendto(b"X=1", str(tmp_path / "notify"))
+        ticks = daemon.ask("status")["ticks"]
+        wait(lambda: daemon.ask("status")["ticks"] > ticks + 1000, "ticks")
+        assert daemon.ask("status")["state"] == "ARMED"
+        daemon.process.terminate()
+        assert daemon.process.wait(30) == 0
+    finally:
+        daemon.kill()
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
 def test_a_loop_that_dies_or_stands_still_ends_the_daemon_with_a_safe_amplifier(daemon, how):
     daemon.ask("arm")

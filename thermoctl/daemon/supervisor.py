@@ -64,6 +64,7 @@ LOOK_S = 0.1  # time between two checks
 # At most this much time between two checks counts as silence of the loop: beyond it, the supervisor itself
 # was stopped.
 LOOK_LONGEST_S = 0.2
+NOTIFY_S = 0.1  # longest time for systemd to take a message: one that hangs must not hold the supervisor
 LOOP_STOP_S = 3.0  # a loop that does not end within this time after the request is killed
 
 
@@ -91,6 +92,7 @@ class _Notify:
             return
         address = "\0" + self.address[1:] if self.address.startswith("@") else self.address
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s, contextlib.suppress(OSError):
+            s.settimeout(NOTIFY_S)
             s.connect(address)
             s.sendall(text.encode())
 
