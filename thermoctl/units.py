@@ -46,6 +46,52 @@ SYMBOLS = {
 """Symbol: (dimension as text, size in SI units, 0 where only pint has it)."""
 SECONDS = {symbol: float(size) for symbol, (of, size) in SYMBOLS.items() if of == "s"}
 """Seconds of a unit of time."""
+SPELLINGS = {
+    "degC": "celsius | °c | ℃ | degc | deg c | deg. c | grad c | degree c | degrees c | degree "
+    "celsius | degrees celsius | deg_c | ºc | ˚c | oc | â°c | �c",
+    "degF": "fahrenheit | °f | ℉ | degf | deg f | deg. f",
+    "K": "kelvin",
+    "deg": "° | grad | degree | degrees",
+    "h": "hr | hrs | hour | hours | stunde | stunden | std | heure | heures | hora | horas | ore | "
+    "uur | 小时",
+    "ohm": "ohms | ω",
+    "V": "volt | volts | vdc | vac | vrms | v dc | v ac | v rms | v_rms",
+    "mV": "millivolt | millivolts",
+    "A": "ampere | amperes | amp | amps | arms | a dc | a ac | a rms | a_rms",
+    "W": "watt | watts",
+    "kW": "kw",
+    "kWh": "kwh",
+    "var": "var",
+    "kvar": "kvar",
+    "%": "percent | pct | %rh | % rh | rh% | rh % | %rf | % rf | %r.h. | % r.h. | %r.f. | % r.f.",
+    "rpm": "rpm | u/min | upm | r/min | rev/min | revs/min | tr/min | giri/min",
+    "rps": "rps | u/s | r/s | rev/s | revs/s | tr/s",
+    "bar": "bar | barg | bara | bar(g) | bar(a)",
+    "psi": "psi | psig | psia",
+    "kPa": "kpa | kpa(g) | kpa(a)",
+    "hPa": "hpa",
+    "L/min": "lpm | slpm | sl/min | nl/min | ln/min",
+    "mL/min": "sccm",
+    "ft^3/min": "cfm | scfm",
+    "gallon/min": "gpm",
+    "count": "count | counts | tick | ticks | inc | incr | lsb | digit | digits",
+    "N": "newton",
+    "Hz": "hertz",
+    "m": "meter | metre | meters | metres",
+    "s": "second | seconds | sec | secs | sekunde | sekunden | sek | secondes | seconde | segundos "
+    "| segundo | secondi | seconden | sekunder | 秒 | сек",
+    "ms": "millisecond | milliseconds | msec | msecs | millis | millisekunden | мс | millisecondes "
+    "| milisegundos | 毫秒",
+    "us": "microsecond | microseconds | usec | micros | µsec | mikrosekunden | µs",
+    "ns": "nanosecond | nanoseconds | nsec | nanos",
+    "min": "minute | minutes | mins | minuten | minutos | minuti | 分 | мин",
+    "d": "day | days | tag | tage | jour | jours | días | dias | giorni | dagen | 天",
+    "rad": "radian | radians | rads",
+    "arcsec": "arcsecond | arcseconds",
+    "in": "inch | inches",
+    "Pa": "pascal",
+}
+"""Unit: its spellings by loggers and in device files, in lower case, separated by |."""
 _KELVIN = {
     "K": (1.0, 0.0),
     "degC": (1.0, 273.15),

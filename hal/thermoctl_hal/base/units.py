@@ -6,6 +6,9 @@ import math
 import re
 import unicodedata
 
+from thermoctl.units import SPELLINGS
+
+_MARKS = r"[\s._\[\](){}]"
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "um": {"um": (1, 0), "nm": (1e-3, 0), "mm": (1e3, 0), "m": (1e6, 0), "in": (25400, 0)},
     "deg": {"deg": (1, 0), "arcsec": (1 / 3600, 0), "rad": (180 / math.pi, 0), "mrad": (0.18 / math.pi, 0)},
@@ -15,24 +18,18 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "": {"1": (1, 0)},
 }
 """Suffix of the role's name -> {unit: (factor, offset)}."""
-_SPELLINGS = {
-    "degC": "c degc celsius degcelsius degreec degreescelsius degreecelsius grdc gradc centigrade",
-    "degF": "f degf fahrenheit degfahrenheit degreef degreesfahrenheit gradf grdf",
-    "K": "k kelvin degk",
-    "deg": "deg degree degrees grad °",
-    "rad": "radian radians rads",
-    "arcsec": "arcsecond arcseconds",
-    "in": "inch inches",
-    "m": "meter metre meters metres",
-    "V": "v volt volts",
-    "A": "a amp amps ampere amperes",
-    "rpm": "rpm 1/min min-1 u/min rev/min",
-    "Pa": "pa pascal",
-    "bar": "bar",
-    "%": "% percent",
+_SHORT = {
+    "degC": "c degcelsius grdc centigrade",
+    "degF": "f degfahrenheit degreef degreesfahrenheit gradf grdf",
+    "K": "degk",
+    "rpm": "1/min min-1",
 }
-"""Our spelling of a unit -> those of other files in lower case, without blanks, points and brackets."""
-_KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+"""Unit -> further spellings that only device files have."""
+_OTHERS = ("rpm", "Pa", "bar", "%")
+"""Units of quantities that no role has."""
+_KNOWN = {unit.lower(): unit for unit in (*_OTHERS, "V", "A", "K", "deg", "degC", "degF")}
+_KNOWN |= {re.sub(_MARKS, "", s): unit for unit, words in SPELLINGS.items() for s in words.split(" | ")}
+_KNOWN |= {spelling: unit for unit, spellings in _SHORT.items() for spelling in spellings.split()}
 _WORDS = {"micro": "u", "milli": "m", "kilo": "k", "nano": "n", "centi": "c", "mega": "M"}
 _PREFIXED = {p + u: p + u for p in "numckM" for u in ("m", "V", "A", "rad", "K", "Pa", "bar")}
 """Units with a prefix, which are written exactly so: mV is not MV."""
@@ -52,7 +49,7 @@ def dbc_unit(text: str | None) -> str:
         .replace("μ", "u")
         .replace("µ", "u")
     )
-    plain = re.sub(r"[\s._\[\](){}]", "", plain)
+    plain = re.sub(_MARKS, "", plain)
     for word, prefix in _WORDS.items():
         if plain.lower().startswith(word) and len(plain) > len(word):
             unit = dbc_unit(plain[len(word) :])
@@ -66,4 +63,4 @@ def dbc_unit(text: str | None) -> str:
 
 def is_convertible(unit: str) -> bool:
     """Return whether a unit is known, so that readings in another unit can be converted."""
-    return unit in _SPELLINGS or unit in _PREFIXED or any(unit in u for u in _UNITS.values() if len(u) > 1)
+    return unit in _OTHERS or unit in _PREFIXED or any(unit in u for u in _UNITS.values() if len(u) > 1)

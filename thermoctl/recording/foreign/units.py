@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from thermoctl.units import SECONDS, conversion, dimension, ratio
+from thermoctl.units import SECONDS, SPELLINGS, conversion, dimension, ratio
 
 WORDS: dict[str, Any] = yaml.load(
     Path(__file__).with_name("words.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -27,7 +27,7 @@ _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*
 _LAST = re.compile(
     r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$"
 )  # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope
-_SPELLED = {word.strip(): unit for unit, words in WORDS["units"].items() for word in words.split("|")}
+_SPELLED = {word: unit for unit, words in SPELLINGS.items() for word in words.split(" | ")}
 
 
 def spelled(unit: str | None, name: str = "") -> str | None:
