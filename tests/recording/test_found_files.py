@@ -516,6 +516,12 @@ def test_a_unit_directly_behind_a_name(tmp_path):
     assert read(tmp_path, text).units == {"Temperature": "degC", "Humidity": "%"}
 
 
+def test_a_horizontal_plane_is_no_hour(tmp_path):
+    lines = [f"20050101:{h:02d}00,{h}.5,{10 * h},{h}" for h in range(6)]
+    found = read(tmp_path, rows("time(UTC),T2m,G(h),t_run(h)", *lines))
+    assert list(found.columns) == ["T2m", "G(h)", "t_run"] and found.units == {"t_run": "h"}
+
+
 def test_columns_of_a_fixed_width_are_refused_with_a_remedy(tmp_path):
     text = rows(" 12839 MIAMI FL -5 N 25 48", *(f" 620101{h:02d}00000000?0000?0" for h in range(1, 9)))
     with pytest.raises(InputError, match="run.csv:1: .*fixed width: write them with commas"):

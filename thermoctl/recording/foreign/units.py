@@ -77,6 +77,8 @@ def split_unit(header: str) -> tuple[str, str | None]:
     unit = (square if square is not None else bracket if bracket is not None else slash).strip()
     if square is not None and known(name) and not known(unit):  # °C [Kanal 1] of Testo
         return unit, spelled(name, unit)
+    if unit == "h" and re.fullmatch(r"[A-Z]\w?\(h\)", text):  # G(h) of PVGIS: on the horizontal plane
+        return text, None
     if unit.isdigit() and (unit != "1" or not text[match.end(1)].isspace()):  # motor[1] is a motor
         return text, None
     if square is None and not known(unit):
