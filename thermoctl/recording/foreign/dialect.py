@@ -95,6 +95,11 @@ def lines(text: str) -> Iterator[tuple[int, str]]:
             yield number, line.rstrip("\r\n")
 
 
+def shown(separator: str) -> str:
+    """Return a separator for people."""
+    return {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
+
+
 def is_comment(line: str) -> bool:
     """Return whether a line is a comment: # first, but no column's name `#` (HOBO), no `#N/A` of Excel."""
     return bool(_COMMENT.match(line))
@@ -171,8 +176,7 @@ def find_dialect(path: Path, text: str) -> Dialect:
     facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
     decimal = _decimal(data, separator)
     if separator != "," and width > 1:
-        shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(separator, f"'{separator}'")
-        notes.append(f"separator {shown}" + (", decimal comma" if decimal == "," else ""))
+        notes.append(f"separator {shown(separator)}" + (", decimal comma" if decimal == "," else ""))
     return Dialect(
         separator, decimal, names, units, first, _numeric(names, data), tuple(notes), facts, header, longer
     )

@@ -11,7 +11,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from thermoctl.recording.foreign.clock import Seconds
 from thermoctl.recording.foreign.dialect import distinct
 from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.modelica import trajectories
-from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.sheet import Cells, Sheet, as_cells, place_in
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import units
@@ -47,19 +47,11 @@ def _timed(
     sheets: dict[tuple[int, bytes, str | None], Sheet] = {}
     names = [c[0] for c in channels]
     for name, unit, t, values, start in channels:
-        if values.dtype.kind in "SO" and values.ndim == 1:
-            values = pa.array(
-                [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.tolist()]
-            )
-        elif values.dtype.kind == "U" and values.ndim == 1:
-            values = pa.array(values.tolist())
-        elif values.ndim != 1 or values.dtype.kind not in "fiubmM":
+        if values.ndim != 1 or values.dtype.kind not in "fiubmMSUO":
             notes.append(
                 f"channel '{name}' left out: each sample is {values.dtype} {values.shape[1:]}, no number"
             )
             continue
-        elif values.dtype.kind in "iub":
-            values = values.astype(float)
         if len(values) != len(t):
             notes.append(f"channel '{name}' left out: {len(values)} values and {len(t)} times")
             continue
@@ -71,19 +63,15 @@ def _timed(
             )
         key = (len(t), np.ascontiguousarray(t).tobytes(), start)
         seconds = Seconds(np.asarray(t, float), start, "", "unit")
-        sheet = sheets.setdefault(key, Sheet({}, _row_of(path), clock=seconds, start=start))
+        sheet = sheets.setdefault(key, Sheet({}, place_in(path), clock=seconds, start=start))
         if names.count(name) > 1 and name in [n for s in sheets.values() for n in s.columns]:
             raise InputError(
                 f"{path}: two channels are called '{name}'; export them under names of their own"
             )
-        sheet.columns[name] = values
+        sheet.columns[name] = as_cells(values)
         if stated := spelled(unit, name):
             sheet.units[name] = stated
     return list(sheets.values())
-
-
-def _row_of(path: Path) -> Callable[[int], str]:
-    return lambda row: f"{path}: row {row + 1}"
 
 
 def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
@@ -169,21 +157,15 @@ def _group(path: Path, title: str, channels: dict[str, tuple[np.ndarray, str]], 
     """Return the channels (values, unit) of a group as a table; another length is left out with a note."""
     lengths = [len(v) for v, _ in channels.values() if len(v)]
     rows = max(set(lengths), key=lengths.count) if lengths else 0
-    table = Sheet({}, _row_of(path), name=title)
+    table = Sheet({}, place_in(path), name=title)
     for name, (values, unit) in channels.items():
         if len(values) != rows or not rows:
             notes.append(f"channel '{title}/{name}' left out: {len(values)} values; the others have {rows}")
             continue
-        table.columns[name] = _column(values)
+        table.columns[name] = as_cells(values)
         if stated := spelled(unit, name):
             table.units[name] = stated
     return table
-
-
-def _column(values: np.ndarray) -> Cells:
-    if values.dtype.kind in "iub":
-        return values.astype(float)
-    return values if values.dtype.kind in "fmM" else pa.array([str(v) for v in values.tolist()])
 
 
 def _chosen(path: Path, name: str, names: list[str], what: str) -> str:
@@ -235,7 +217,7 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
     """Read a MATLAB file, 4 to 7.3: tables, timetables, structs, vectors. Raises InputError."""
     content = _loaded(path)
     if (result := trajectories(content, notes)) is not None:
-        return [Sheet(result[0], _row_of(path), result[1])]
+        return [Sheet(result[0], place_in(path), result[1])]
     step_s = _stated(content)
     if variable is not None:
         content = {variable: content[_chosen(path, variable, list(content), "variable")]}
@@ -243,12 +225,12 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
     loose: dict[str, np.ndarray] = {}
     for name, value in content.items():
         if hasattr(value, "columns"):  # a data frame
-            columns: dict[str, Cells] = {str(c): _column(np.asarray(value[c])) for c in value.columns}
+            columns: dict[str, Cells] = {str(c): as_cells(np.asarray(value[c])) for c in value.columns}
             if value.index.dtype.kind in "mM":
                 columns = {str(value.index.name or "Time"): np.asarray(value.index), **columns}
-            sheets.append(Sheet(columns, _row_of(path), name=name))
+            sheets.append(Sheet(columns, place_in(path), name=name))
         elif len(columns := _vectors(value)) > 1:
-            sheets.append(Sheet(columns, _row_of(path), name=name, step_s=_stated(_fields(value))))
+            sheets.append(Sheet(columns, place_in(path), name=name, step_s=_stated(_fields(value))))
         elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
             loose[name] = np.squeeze(value).astype(float)
     sheets += _of_arrays(path, loose)
@@ -274,7 +256,7 @@ def _of_arrays(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
             of = name if len(own) > 1 else "column"
             columns |= {f"{of}_{i + 1}": c for i, c in enumerate(tall.T)}
         if len(columns) > 1:
-            sheets.append(Sheet(columns, _row_of(path), name=", ".join(own)))
+            sheets.append(Sheet(columns, place_in(path), name=", ".join(own)))
     return sheets
 
 
@@ -331,7 +313,7 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
         for k, v in (arrow.schema.metadata or {}).items()
     }
     sheet = Sheet(
-        {}, _row_of(path), meta={k: v for k, v in said.items() if k not in ("pandas", "ARROW:schema")}
+        {}, place_in(path), meta={k: v for k, v in said.items() if k not in ("pandas", "ARROW:schema")}
     )
     for name, column, kind in zip(distinct(arrow.column_names), arrow.columns, arrow.schema, strict=True):
         column = column.combine_chunks()

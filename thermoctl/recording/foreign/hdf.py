@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.foreign.sheet import Cells, Sheet
+from thermoctl.recording.foreign.sheet import Cells, Sheet, as_cells, place_in
 from thermoctl.recording.foreign.units import spelled
 
 _NONE = b"N."  # None as PyTables pickles it
@@ -31,7 +30,7 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
             return
         columns = _columns(name, item)
         own = above if item.dtype.names is None else place
-        sheet = sheets.setdefault((own or "/", len(item)), Sheet({}, _row_of(path), name=own or "/"))
+        sheet = sheets.setdefault((own or "/", len(item)), Sheet({}, place_in(path), name=own or "/"))
         sheet.columns |= columns
         if len(columns) == 1 and (
             unit := spelled(_text(item.attrs.get("units", item.attrs.get("unit", ""))), name)
@@ -53,10 +52,6 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
             f"'{chosen[0].name}' read, {len(chosen[0])} rows, of {', '.join(names)} (another: --sheet GROUP)"
         )
     return chosen[:1]
-
-
-def _row_of(path: Path) -> Any:
-    return lambda row: f"{path}: row {row + 1}"
 
 
 def _text(value: Any) -> str:
@@ -97,13 +92,7 @@ def _pickled(value: Any) -> list[str]:
 
 def _split(name: str, values: np.ndarray, titles: list[str]) -> dict[str, Cells]:
     if values.ndim == 1:
-        return {name: _cells(values)}
+        return {name: as_cells(values)}
     width = values.shape[1]
     own = titles if len(titles) == width else [f"{name}_{k + 1}" for k in range(width)]
-    return {n: _cells(c) for n, c in zip(own, values.T, strict=True)}
-
-
-def _cells(values: np.ndarray) -> Cells:
-    if values.dtype.kind in "iub":
-        return values.astype(float)
-    return values if values.dtype.kind in "fmM" else pa.array([_text(v) for v in values.tolist()])
+    return {n: as_cells(c) for n, c in zip(own, values.T, strict=True)}

@@ -19,7 +19,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
 from thermoctl.recording.foreign.names import NO_NAME, named
-from thermoctl.recording.foreign.sheet import Sheet
+from thermoctl.recording.foreign.sheet import Sheet, place_in
 from thermoctl.recording.foreign.units import WORDS, spelled
 
 IDS = WORDS["identities"].split()
@@ -55,10 +55,6 @@ def _sheet(
     return Sheet(dict(texts), place, name=name)
 
 
-def _item(path: Path) -> Callable[[int], str]:
-    return lambda row: f"{path}: item {row + 1}"
-
-
 def _word(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
@@ -67,7 +63,7 @@ def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
     records = [_flat(r) for r in records]
     names = list(dict.fromkeys(k for r in records for k in r))
     columns = {n: [r.get(n) for r in records] for n in names}
-    return _sheet(path, columns, lambda row: f"{path}: record {row + 1}")
+    return _sheet(path, columns, place_in(path, "record"))
 
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,7 +123,7 @@ def _lists(path: Path, content: Mapping[str, Any]) -> Sheet | None:
     rows = max((n for n in lengths if lengths.count(n) > 1), default=0)
     if not rows:
         return None
-    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, _item(path))
+    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
     sheet.notes += [
         f"list '{k}' left out: {len(v)} items; the others have {rows}"
         for k, v in lists.items()
@@ -158,7 +154,9 @@ def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
         names = content[0] if rows is not content else [f"column_{i + 1}" for i in range(len(rows[0]))]
         plain = not any(isinstance(y, dict | list) for x in rows for y in x)
         if plain and {len(x) for x in rows} == {len(set(names))} != {1}:
-            return [_sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), _item(path))]
+            return [
+                _sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))
+            ]
     return None
 
 
@@ -202,7 +200,7 @@ def _temperature_store(path: Path, content: Mapping[str, Any]) -> list[Sheet] | 
     if not columns:
         return None
     rows = min(len(c) for c in columns.values())
-    sheet = _sheet(path, {n: c[len(c) - rows :] for n, c in columns.items()}, _item(path))
+    sheet = _sheet(path, {n: c[len(c) - rows :] for n, c in columns.items()}, place_in(path, "item"))
     sheet.units = {n: "degC" for n in columns if not n.endswith("_power")}
     sheet.step_s = 1.0
     return [sheet]

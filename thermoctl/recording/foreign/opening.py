@@ -24,10 +24,11 @@ from thermoctl.recording.foreign.dialect import (
     find_dialect,
     is_comment,
     lines,
+    shown,
 )
 from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.hdf import read_hdf
-from thermoctl.recording.foreign.sheet import Cells, How, Sheet
+from thermoctl.recording.foreign.sheet import Cells, How, Sheet, place_in
 from thermoctl.recording.foreign.timing import table_of
 from thermoctl.recording.foreign.units import split_words
 
@@ -106,7 +107,7 @@ def _of_names(sheet: Sheet) -> Sheet:
 
 def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     table = files.read_table(path)
-    return [Sheet({"t": table.t, **table.columns}, lambda row: f"{path}: row {row + 1}", meta=table.meta)]
+    return [Sheet({"t": table.t, **table.columns}, place_in(path), meta=table.meta)]
 
 
 def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
@@ -163,7 +164,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
     if len(dialect.names) == 1:
         text = _with_empty_lines(text, dialect, notes)
-    how.trace.append(f"read as: {_described(dialect)}")
+    how.trace.append(f"read as: text, separator {shown(dialect.separator)}, data from line {dialect.first}")
     notes += dialect.notes
 
     def closely() -> list[Sheet]:
@@ -200,11 +201,6 @@ def _with_empty_lines(text: bytes, dialect: Dialect, notes: list[str]) -> bytes:
         return text
     notes.append("empty lines between the rows read as no value")
     return text.removesuffix(body) + rows + b"\n"
-
-
-def _described(dialect: Dialect) -> str:
-    shown = {"\t": "tab", " ": "blanks", "  ": "blanks"}.get(dialect.separator, f"'{dialect.separator}'")
-    return f"text, separator {shown}, data from line {dialect.first}"
 
 
 def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -13,6 +14,22 @@ from thermoctl.recording.foreign.clock import Seconds
 
 Cells: TypeAlias = np.ndarray | pa.Array
 """A column: float64, datetime64 or timedelta64 values, or texts."""
+
+
+def place_in(path: Path, what: str = "row") -> Callable[[int], str]:
+    """Return a function that names data row k (from 0) of a file without lines."""
+    return lambda row: f"{path}: {what} {row + 1}"
+
+
+def as_cells(values: np.ndarray) -> Cells:
+    """Return an array of any kind as a column: numbers, times, or texts."""
+    if values.dtype.kind in "iub":
+        return values.astype(float)
+    if values.dtype.kind in "fmM":
+        return values
+    return pa.array(
+        [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.tolist()]
+    )
 
 
 EQUAL_TIMES = ("spread", "mean", "first", "last")
