@@ -130,6 +130,13 @@ def of_one_year(seconds: Seconds) -> Seconds:
     return replace(seconds, t=t, note=f"{seconds.note}; months of several years put together as one year")
 
 
+def is_even(t: np.ndarray) -> bool:
+    """Return whether times (N,) increase in every row, most steps within 2 % of the median."""
+    steps = np.diff(t[np.isfinite(t)])
+    usual = np.median(steps) if len(steps) else 0.0
+    return bool(np.all(steps > 0) and np.median(np.abs(steps - usual)) <= 0.02 * usual) if usual else False
+
+
 def grain(t: np.ndarray) -> float:
     """Return the largest of 60, 1, 0.1, 0.01 ... s that divides all times (N,), counted from the first."""
     t = t[np.isfinite(t)]

@@ -18,8 +18,15 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.facts import aligned, facts_of, take_below
-from thermoctl.recording.foreign.names import named
-from thermoctl.recording.foreign.units import WORDS, known, spelled, split_slash, split_unit, split_words
+from thermoctl.recording.foreign.units import (
+    WORDS,
+    known,
+    named,
+    spelled,
+    split_slash,
+    split_unit,
+    split_words,
+)
 from thermoctl.units import SECONDS
 
 SAMPLE = 400  # number of first lines from which the dialect is found

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 
 from thermoctl.recording.foreign.cells import is_number
-from thermoctl.recording.foreign.names import named
-from thermoctl.recording.foreign.units import known, spelled, split_unit, time_unit
+from thermoctl.recording.foreign.units import known, named, spelled, split_unit, time_unit
 from thermoctl.units import SECONDS
 
 _STEP = re.compile(

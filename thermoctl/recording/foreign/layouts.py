@@ -18,9 +18,8 @@ import pyarrow.compute as pc
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
-from thermoctl.recording.foreign.names import NO_NAME, named
 from thermoctl.recording.foreign.sheet import Sheet, place_in
-from thermoctl.recording.foreign.units import WORDS, spelled
+from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled
 
 IDS = WORDS["identities"].split()
 VALUES = WORDS["values"].split()

@@ -26,11 +26,10 @@ import pyarrow.parquet
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
 from thermoctl.recording.foreign.dialect import cells_of, lines
-from thermoctl.recording.foreign.names import tokens
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
 from thermoctl.recording.foreign.timing import MIXED, table_of
-from thermoctl.recording.foreign.units import column_of, split_unit
+from thermoctl.recording.foreign.units import column_of, split_unit, tokens
 from thermoctl.recording.table import Table
 
 

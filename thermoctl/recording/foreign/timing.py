@@ -17,9 +17,8 @@ from thermoctl.recording.foreign import axis, cells, clock
 from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
 from thermoctl.recording.foreign.clock import ClockError, Seconds
-from thermoctl.recording.foreign.names import named, tokens
 from thermoctl.recording.foreign.sheet import How, Sheet
-from thermoctl.recording.foreign.units import column_of, interval
+from thermoctl.recording.foreign.units import column_of, interval, named, tokens
 from thermoctl.recording.table import Table
 
 _ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
