@@ -79,9 +79,8 @@ def findings(found: Mapping[str, Any], back: Mapping[str, str]) -> dict[str, flo
     out = {}
     for f in found["findings"]:
         ends = [back.get(w, w) for w in f["where"].split("-")]
-        out[f"{f['effect']} at {'-'.join(sorted(ends) if f['effect'] in EITHER_WAY else ends)}"] = f[
-            "probability"
-        ]
+        kinds = " or ".join(sorted(f["effect"].split(" or ")))  # of a family, in any order
+        out[f"{kinds} at {'-'.join(sorted(ends) if f['effect'] in EITHER_WAY else ends)}"] = f["probability"]
     return out
 
 

@@ -243,7 +243,7 @@ def swept_stage(folder, read):
 @pytest.mark.parametrize(("period", "size", "rows"), [(0.25e-3, 3e-6, 6000), (0.06e-3, 0.3e-6, 500)])
 def test_a_cyclic_error_of_a_period_far_below_the_travel_is_found(tmp_path, monkeypatch, period, size, rows):
     """The shorter one passes more than once in a sample, and 8 samples are summed in a row of the screening."""
-    monkeypatch.setattr("thermoctl.diagnosis.search.screening.ROWS", rows)
+    monkeypatch.setattr("thermoctl.diagnosis.search.metric.ROWS", rows)
     (tmp_path / "plant.yaml").write_text(SPRING_STAGE)
     paths = swept_stage(tmp_path, lambda x, noise: x + size * np.sin(2 * np.pi * x / period + 0.7) + noise)
     r = diagnosed(paths, tmp_path / "out")
@@ -285,10 +285,9 @@ def test_dry_friction_that_sticks_is_no_load(tmp_path):
         paths.append(tmp_path / f"run_{seed}.csv")
         write(paths[-1], "t,force,encoder", rows)
     r = diagnosed(paths, tmp_path / "out")
-    assert [(f["effect"], f["where"]) for f in r["findings"]] == [("coulomb_friction", "velocity")] and r[
-        "verdict"
-    ] != "unexplained"
-    found = {k.split("_")[0]: v["value"] for k, v in r["findings"][0]["parameters"].items()}
+    (friction,) = r["findings"]
+    assert friction["probability"] > 0.9 and friction["members"][0]["effect"] == "coulomb_friction"
+    found = {k.split("_")[0]: v["value"] for k, v in friction["parameters"].items()}
     assert found["F"] == pytest.approx(dry, rel=0.15) and found["W"] < 2e-6  # m/s, of 0.3: it does not creep
 
 

@@ -20,8 +20,8 @@ def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
         seen = set[int]()
         side_by_side = cores.each
 
-        def each(f, items, numbers, seen=seen, side_by_side=side_by_side):
-            return side_by_side(lambda x: (seen.add(threading.get_ident()), f(x))[1], items, numbers)
+        def each(f, items, *numbers, seen=seen, side_by_side=side_by_side):
+            return side_by_side(lambda x: (seen.add(threading.get_ident()), f(x))[1], items, *numbers)
 
         with monkeypatch.context() as patch:
             patch.setattr(refits, "each", each)
