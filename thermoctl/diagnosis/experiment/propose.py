@@ -369,6 +369,6 @@ def _sensor(comparison: _Comparison, best: _Trial) -> str:
     if where:
         return f"A sensor of its own at {where} would tell more ({most:.2f} bits with the same experiment)."
     return (
-        f"No experiment of the family decides for sure between {comparison.predictors[0].label} and the others inside the "
+        f"None of the experiments that were tried decides for sure between {comparison.predictors[0].label} and the others inside the "
         "recorded limits; a larger range of the inputs or another sensor would be needed."
     )
