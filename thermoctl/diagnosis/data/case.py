@@ -152,6 +152,7 @@ def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
     plant, read = model.plant, direct_outputs(model.plant)
 
     def start(state: str) -> float:
+        """Return the start of one state."""
         if state in known:
             return float(known[state])
         if read.get(state) in d.first:

@@ -117,6 +117,7 @@ def simpler_law(p: Proposal, f: Fitted) -> Proposal:
     c, values = f.hypothesis.effects[-1].candidate, f.plant.parameters
 
     def value(q: str) -> float:
+        """Return the fitted value of a parameter of the law."""
         return values[c.own(q)].value
 
     sizes = [[value(f"{q}{k}") for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]

@@ -174,6 +174,7 @@ def _general(
     """Return a change of an effect with the symbols of an effect file."""
 
     def in_symbols(text: str) -> str:
+        """Return an expression with the symbols of an effect file."""
         return str(ex.fill(ex.parse(text), symbols))
 
     ((kind, what),) = change.items()

@@ -59,6 +59,7 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
         values = signals(model, d, fit.values[r], model.run(d, fit.values[r], fit.dx0[r]).x)
 
         def median(e: ex.Expr, values: dict[str, np.ndarray | float] = values) -> float:
+            """Return the median of an expression over time."""
             return float(np.median(np.asarray(ex.evaluate(e, values), float)))
 
         for i, slope in enumerate(model.code.slopes):

@@ -196,7 +196,8 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
         sizes = [tuple(s for part in sizes for s in part)]
 
     @cache
-    def overlay() -> Overlay:  # the groups share it: only their values differ
+    def overlay() -> Overlay:
+        """Return the parts of the plant that the candidate changes: the groups share them."""
         return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]

@@ -14,9 +14,7 @@ from thermoctl.plant.simulation.simulate import Simulation
 
 REPEATED = 2.0  # least number of periods over the span of the signal
 BEYOND = 1 / 3, 2 / 3  # levels above the last quantile: shares of the way to the extreme
-LEAST_STEPS = (
-    1.5  # least period of a reading's error, in steps of the reading: rounding has the period of one
-)
+LEAST_STEPS = 1.5  # least period of a reading's error, in its steps; rounding has the period of one step
 ROUNDED = 1e-9  # gap between readings that only the arithmetic makes, over their range
 WHOLE = 0.01  # largest distance of a rounded reading from a multiple of its step, in steps
 # Periods over the span of the signal: up to the first number all are tried, up to the second the strongest.
