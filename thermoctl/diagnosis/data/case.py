@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -121,57 +119,38 @@ class Case:
         return [self.null.model.outputs[c.output] for c in channels]
 
     def drives(self, model: Model) -> list[Excitation]:
-        """Return the recordings as a model reads them. Models that read the same columns share the arrays.
+        """Return the recordings as a model reads them.
 
         A part after a gap starts from its readings, also in a model with further states."""
-        null = self.null.model
-        if _readings(model) != _readings(null):
-            return self._excitations(model)
-        return [dataclasses.replace(d, x0=_start(d, null.states, model)) for d in self._read]
+        drives = [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
+        return [dataclasses.replace(d, x0=_start(d, self.null.model, model)) for d in drives]
 
     def rig(self, plant: Plant, drives: Sequence[Excitation]) -> Rig:
         """Return the parts and signals of a plant, with these recordings."""
         return Rig(plant, drives, [t.columns for t in self.tables])
 
-    @cached_property
-    def _read(self) -> list[Excitation]:
-        return self._excitations(self.null.model)
 
-    def _excitations(self, model: Model) -> list[Excitation]:
-        return [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
-
-
-def _start(d: Excitation, of: Sequence[str], model: Model) -> np.ndarray | None:
-    """Return where a part's states start, for a model with further states than `of`.
+def _start(d: Excitation, null: Model, model: Model) -> np.ndarray | None:
+    """Return where a part's states start, for a model with further states than `null`.
 
     A further state starts from its own reading. Without one it starts like the node that it exchanges with,
     if the plant states the same initial value for both. NaN stands for the plant's initial value."""
     if d.x0 is None:
         return None
-    known = dict(zip(of, d.x0, strict=True))
-    plant, read = model.plant, direct_outputs(model.plant)
+    plant = model.plant
 
     def start(state: str) -> float:
         """Return the start of one state."""
-        if state in known:
-            return float(known[state])
-        if read.get(state) in d.first:
-            return d.first[read[state]]
+        known = state in null.states
+        read = direct_outputs(null.plant if known else plant).get(state, "")
+        if known or read in d.first:
+            return d.first.get(read, np.nan)
         ends = ({f.source, f.target} for f in plant.flows.values())
-        beside = [n for pair in ends if state in pair for n in known if n in pair]
-        same = (n for n in beside if plant.nodes[n].initial == plant.nodes[state].initial)
-        return float(known.get(next(same, ""), np.nan))
+        beside = [n for pair in ends if state in pair for n in null.states if n in pair]
+        same = [n for n in beside if plant.nodes[n].initial == plant.nodes[state].initial]
+        return start(same[0]) if same else np.nan
 
     return np.array([start(n) for n in model.states])
-
-
-def _readings(model: Model) -> list[Any]:
-    """Return all properties of a model that decide how it reads a recording.
-
-    A delayed input has a column of its own."""
-    plant = model.plant
-    outputs = [(o.name, o.column, o.unit, o.conversion) for o in plant.outputs.values()]
-    return [*plant.inputs.values(), *model.code.inputs, *outputs]
 
 
 def case(

@@ -81,8 +81,7 @@ class Sums:
     """One recording's share of gradient and curvature of the log likelihood, by its unknowns (k,).
 
     - `gradient` (k,), `matrix` (k, k): J' E[1/V] R and J' E[1/V] J
-    - `by_band`: for each channel, J' R in each band (bands, k); empty until `relief` asks for it, unless
-      slopes are not kept"""
+    - `by_band`: for each channel, J' R in each band (bands, k); empty unless `relief` asks for it"""
 
     unknowns: np.ndarray
     gradient: np.ndarray
@@ -141,13 +140,14 @@ def _simulated_sums(
     channels: Sequence[Channel],
     rows: Sequence[np.ndarray],
     inverse: Sequence[np.ndarray],
+    bands: bool,
 ) -> Sums:
     """Return a recording's sums. Its slopes are computed and not kept."""
     run = problem.model.run(problem.excitations[r], values, dx0, sensitivities=True, states=False)
     used, unknowns, slope = problem.slopes(r, values)
     dy = run.sensitivities  # copied one channel at a time: a recording has megabytes
     slopes = (_slope_rows(c, dy, used, slope) for c in channels)
-    return _sums(channels, unknowns, slopes, rows, inverse, True)
+    return _sums(channels, unknowns, slopes, rows, inverse, bands)
 
 
 class Posterior:
@@ -181,7 +181,6 @@ class Posterior:
         coordinates = case.coordinates
         self.channels = [coordinates.of_recording(r) for r in range(len(self.drives))]
         self.kept: Slopes | None = None
-        self.newest: tuple[np.ndarray, Sequence[Sums]] | None = None
 
     def rows(self, e: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Transform samples (N, outputs, ...) of each recording to DCT rows (rows, ...) of each channel."""
@@ -238,7 +237,7 @@ class Posterior:
             begin = end
         if not self.problem.keeps:
             point = self.problem.unpack(z)
-            return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r]), 2)
+            return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r], bands), 2)
         if self.kept is None or not np.array_equal(self.kept[0], z):
             self.errors_and_slopes(z)
         assert self.kept is not None
@@ -251,8 +250,7 @@ class Posterior:
         """Return the gradient (k,) of the log posterior at z, and minus its second derivative (k, k)."""
         n = len(z)
         gradient, matrix = np.zeros(n), np.zeros((n, n))
-        self.newest = z.copy(), self.sums(z, rows, inverse)
-        for s in self.newest[1]:
+        for s in self.sums(z, rows, inverse):
             gradient[s.unknowns] += s.gradient
             matrix[np.ix_(s.unknowns, s.unknowns)] += s.matrix
         values, _ = self.problem.unpack(z)
@@ -262,9 +260,7 @@ class Posterior:
     def relief(self, z: np.ndarray, rows: Sequence[np.ndarray], average: Averaged) -> np.ndarray:
         """Return the curvature that is lost because V is not known: the gradient's variance (Louis 1982)."""
         out = np.zeros((len(z), len(z)))
-        sums = self.newest[1] if self.newest is not None and np.array_equal(self.newest[0], z) else []
-        if not sums or not sums[0].by_band:
-            sums = self.sums(z, rows, average.inverse, True)
+        sums = self.sums(z, rows, average.inverse, True)
         by_band = [(s.unknowns, x) for s in sums for x in s.by_band]
         powers = self.case.coordinates.powers(rows)
         for g, unsure in zip(self.case.grids, averaged(self.case.grids, powers, True).unsure, strict=True):

@@ -86,24 +86,12 @@ class Tracked:
         parameters absorb gives zeros."""
         if place.part == "storage":
             flows = [-q * s[:, None] for q, s in zip(flows, self._slopes(place.target), strict=True)]
-        some = [[q[:, k : k + TOGETHER] for q in flows] for k in range(0, flows[0].shape[1], TOGETHER)]
         with np.errstate(all="ignore"):
-            parts = [self.metric.responses(partial(self._pushed, place, q), q[0].shape[1]) for q in some]
-            whole = np.concatenate(parts, axis=1) * self.metric.weight[:, None]
+            whole = _responses(self.metric, place, flows)
             rest = self.metric.project(whole)
             rest = self.beyond.without(rest) if self.beyond else rest
             absorbed = np.linalg.norm(rest, axis=0) < ABSORBED * np.linalg.norm(whole, axis=0)
         return np.where(absorbed, 0.0, rest)
-
-    def _pushed(self, place: Place, flows: Sequence[np.ndarray], r: int) -> Pushed:
-        """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
-        model, t = self.metric.model, self.metric.drives[r].t
-        forces, q = list[tuple[int, int]](), []
-        for k, node in enumerate(reversed(place.nodes)):
-            storage = ex.series(model.plant.nodes[node].storage, self.metric.signals[r], t)
-            forces += [(model.states.index(node), c) for c in range(flows[r].shape[1])]
-            q.append((-1) ** k * np.nan_to_num(flows[r]) / storage[:, None])
-        return Pushed(forces, np.concatenate(q, axis=1), {})
 
     def flows(self, nodes: Sequence[str]) -> tuple[float, float]:
         """Return the log marginal likelihood of free flows into nodes, over that of none, and their size.
@@ -143,20 +131,29 @@ def _gain(share: float, square: np.ndarray, force: np.ndarray) -> float:
 
 
 def flow_rows(metric: Metric, node: str, hats: Sequence[csr_matrix], size: float = 1.0) -> list[np.ndarray]:
-    """Return, by recording, the rows of the responses to flows into a node: hat functions times `size`.
+    """Return, by recording, the rows of the responses to flows into a node: hat functions times `size`."""
+    whole = _responses(metric, Place(node), [size * hat.toarray() for hat in hats])
+    return np.split(whole, np.cumsum([sum(c.rows for c in own) for own in metric.plain.channels])[:-1])
+
+
+def _responses(metric: Metric, place: Place, flows: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the whitened rows (rows, k) of the responses to flows (N, k), by recording, at a place.
 
     To save memory, TOGETHER responses are simulated at a time."""
-    blocks, model = [], metric.model
-    for r, (d, hat) in enumerate(zip(metric.drives, hats, strict=True)):
-        parts, q = [], size * hat.toarray()
-        force = q / ex.series(model.plant.nodes[node].storage, metric.signals[r], d.t)[:, None]
-        for part in np.split(force, range(TOGETHER, q.shape[1], TOGETHER), axis=1):
-            k = part.shape[1]
-            entries = [(model.states.index(node), j) for j in range(k)]
-            dy = model.respond(d, metric.fit.values[r], metric.fit.dx0[r], entries, part, k)
-            parts.append(metric.rows(r, dy))
-        blocks.append(np.concatenate(parts, axis=1))
-    return blocks
+    some = [[q[:, k : k + TOGETHER] for q in flows] for k in range(0, flows[0].shape[1], TOGETHER)]
+    parts = [metric.responses(partial(_pushed, metric, place, q), q[0].shape[1]) for q in some]
+    return np.concatenate(parts, axis=1) * metric.weight[:, None]
+
+
+def _pushed(metric: Metric, place: Place, flows: Sequence[np.ndarray], r: int) -> Pushed:
+    """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
+    model, t = metric.model, metric.drives[r].t
+    forces, q = list[tuple[int, int]](), []
+    for k, node in enumerate(reversed(place.nodes)):
+        storage = ex.series(model.plant.nodes[node].storage, metric.signals[r], t)
+        forces += [(model.states.index(node), c) for c in range(flows[r].shape[1])]
+        q.append((-1) ** k * np.nan_to_num(flows[r]) / storage[:, None])
+    return Pushed(forces, np.concatenate(q, axis=1), {})
 
 
 def with_latent(plant: Plant, nodes: Sequence[str]) -> Plant:
@@ -204,16 +201,6 @@ class _Spot:
         return _Spot(flows, self.z + share * (aim.z - self.z))
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """The plant at a spot: its rows, the whitened residuals by recording, and their sum of squares."""
-
-    plain: Plain
-    metric: Metric
-    residual: list[np.ndarray]
-    size: float
-
-
 class _Tracking:
     """A fitted hypothesis with unknown flows into nodes, which are to follow the recordings."""
 
@@ -234,8 +221,8 @@ class _Tracking:
         """Return the spot without unknown flows."""
         return _Spot([np.zeros((self.knots, len(self.nodes))) for _ in self.hats], self.f.rough.z)
 
-    def look(self, at: _Spot) -> _Seen | None:
-        """Return the plant at a spot; None where it cannot be simulated there."""
+    def look(self, at: _Spot) -> tuple[Metric, list[np.ndarray]] | None:
+        """Return the plant at a spot, and its whitened residuals by recording; None without a simulation."""
         tables = tuple(
             dataclasses.replace(
                 t, columns={**t.columns, **{f"{LATENT}{n}": h @ w[:, i] for i, n in enumerate(self.nodes)}}
@@ -244,30 +231,30 @@ class _Tracking:
         )
         case = dataclasses.replace(self.case, tables=tables)
         try:
-            plain = _at(case, self.f.rough, self.model, at.z)
-            metric = Metric(plain, self.average, False)
+            metric = Metric(_at(case, self.f.rough, self.model, at.z), self.average, False)
             self.sizes = self.sizes or [
                 typical_flow(self.plant, n, metric.signals) or 1.0 for n in self.nodes
             ]
         except SimulationError:
             return None
-        residual = [
+        return metric, [
             metric.rows(r, np.nan_to_num(d.y - metric.runs[r].y)) for r, d in enumerate(metric.drives)
         ]
-        return _Seen(plain, metric, residual, sum(float(e @ e) for e in residual))
 
-    def step(self, at: _Spot, seen: _Seen) -> tuple[_Followed, _Spot, float]:
+    def step(
+        self, at: _Spot, metric: Metric, residual: Sequence[np.ndarray]
+    ) -> tuple[_Followed, _Spot, float]:
         """Return the plant linearised at a spot, the next spot, and the sum of squares promised there."""
-        metric, sizes = seen.metric, np.array(self.sizes)
+        sizes = np.array(self.sizes)
         by_node = [flow_rows(metric, n, self.hats, s) for n, s in zip(self.nodes, self.sizes, strict=True)]
         wide = [np.concatenate(blocks, axis=1) for blocks in zip(*by_node, strict=True)]
         scaled = [(w / sizes).T.ravel() for w in at.flows]
-        misfit = [e + x @ w for e, x, w in zip(seen.residual, wide, scaled, strict=True)]
+        misfit = [e + x @ w for e, x, w in zip(residual, wide, scaled, strict=True)]
         flows = _smoothed(wide, misfit, metric.own)
         left = [e - x @ p for e, x, p in zip(misfit, wide, flows, strict=True)]
         own = [p.reshape(len(self.nodes), self.knots).T * sizes for p in flows]
-        aim = _Spot(own, _started(seen.plain, metric, left))
-        return _Followed(metric, misfit, wide), aim, sum(float(e @ e) for e in left)
+        aim = _Spot(own, _started(metric, left))
+        return _Followed(metric, misfit, wide), aim, _squares(left)
 
 
 def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
@@ -284,18 +271,22 @@ def _followed(case: Case, f: Fitted, nodes: Sequence[str]) -> _Followed:
     for _ in range(STEPS + 1):
         at = here.towards(aim, share)
         seen = tracking.look(at)
-        if seen is None or not seen.size < size:
+        if seen is None or not _squares(seen[1]) < size:
             share *= SHORTER
             if found is None or share < SHORTEST:
                 break
             continue
-        here, size, share = at, seen.size, 1.0
-        found, aim, promised = tracking.step(here, seen)
+        here, size, share = at, _squares(seen[1]), 1.0
+        found, aim, promised = tracking.step(here, *seen)
         if promised > (1 - SETTLED) * size:
             break
     if found is None:
         raise SimulationError("the plant cannot be tracked")
     return found
+
+
+def _squares(rows: Sequence[np.ndarray]) -> float:
+    return sum(float(e @ e) for e in rows)
 
 
 def _at(case: Case, fit: Fit, model: Model, z: np.ndarray) -> Plain:
@@ -307,9 +298,10 @@ def _at(case: Case, fit: Fit, model: Model, z: np.ndarray) -> Plain:
     return Plain(case, dataclasses.replace(fit, model=model, values=values, dx0=dx0, z=z, at_bound={}))
 
 
-def _started(plain: Plain, metric: Metric, left: Sequence[np.ndarray]) -> np.ndarray:
+def _started(metric: Metric, left: Sequence[np.ndarray]) -> np.ndarray:
     """Return the unknowns after a step of the initial states to errors (rows,) that flows leave."""
-    z, first = metric.fit.z.copy(), plain.problem.n_parameters
+    plain, z = metric.plain, metric.fit.z.copy()
+    first = plain.problem.n_parameters
     edges = np.cumsum([len(e) for e in left])[:-1]
     for r, (e, weight) in enumerate(zip(left, np.split(metric.weight, edges), strict=True)):
         ks = plain.unknowns(r)

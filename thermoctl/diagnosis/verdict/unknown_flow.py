@@ -85,7 +85,8 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     Raises SimulationError."""
     metric = Metric(Plain(case, f.fit), f.average, True)
     knots = int(np.clip(TOGETHER // len(metric.runs), FEWEST, KNOTS))
-    hats = [hat_functions(d.t, min(knots, len(d.t))) for d in metric.drives]
+    knots = min(knots, *(len(d.t) for d in metric.drives))
+    hats = [hat_functions(d.t, knots) for d in metric.drives]
     coarse = {name for name, is_coarse in zip(case.measured, rounded(case), strict=True) if is_coarse}
     fine = [o not in coarse for o in case.null.model.outputs]
     counts = np.concatenate([np.full(c.rows, fine[c.output]) for c in metric.plain.coordinates.channels])
