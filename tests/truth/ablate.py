@@ -76,10 +76,6 @@ def _sure(*a: Any) -> float:
     return 1.0
 
 
-def _precise(case: Any, f: Any) -> list[float]:
-    return [0.0] * len(case.grids)
-
-
 def _all(error: Any) -> float:
     return float(len(error))
 
@@ -114,10 +110,6 @@ RULES: Mapping[str, Rule] = {
         "a reading that rests on its steps has no certain remainder",
         {"verdict.misfit.rounded": _fine, "evidence.levels.rounded": _fine},
     ),
-    "timing": Rule(
-        "power at all frequencies that uncertain times may add is noise",
-        {"verdict.misfit.timing": _precise, "evidence.levels.timing": _precise},
-    ),
     "better refit": Rule(
         "of the two refits of a hypothesis the better one counts",
         {"verdict.misfit.as_refitted": _ours, "verdict.confirm.as_refitted": _ours},
@@ -140,7 +132,6 @@ RULES: Mapping[str, Rule] = {
     },
     "floor": Rule("an error far below the noise is luck", {"verdict.confirm.FLOOR": 1e-6}),
     "draws": Rule("a smooth error counts as few draws", {"verdict.confirm._draws": _all}),
-    "size": Rule("a size left out may vanish: its prior", {"verdict.confirm.WIDTH": 1e3}),
     "learnt noise": Rule(
         "a stated noise may be wrong by two standard deviations of its prior",
         {"evidence.levels.levels": _stated},

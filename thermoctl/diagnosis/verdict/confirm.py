@@ -36,7 +36,6 @@ from thermoctl.recording.table import Table
 
 BLOCKS = 8  # parts of each recording
 FLOOR = 0.1  # added to mean squares over the noise: differences between errors far below it are chance
-WIDTH = 2.0  # prior sd of an effect's size about its null value, as a multiple of the refitted size
 DRAWS = 3.0  # n independent normal rows have the participation ratio n / 3
 # An event has a course in time, as a misfit has. Parts of one recording cannot tell them apart, only another
 # recording can.
@@ -85,22 +84,18 @@ class Blocks:
     def _prior(self, log: Posterior, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return precision (k, k) and gradient at z (k,) of the prior, as one Gaussian.
 
-        The prior of an effect's size is centred on its null value: the effect may vanish where the other
-        parts do not need it."""
+        An effect's size may vanish where the other parts do not need it: its bounds hold its null value."""
         problem, z = log.problem, self.z
         _, push, bend = problem.prior_terms(values, True)
         precision, step = log.precision.copy(), log.mean - z
-        own = np.setdiff1d(np.arange(len(z)), np.concatenate([gaussian(log), log.believed]).astype(int))
-        width = {int(k): (0.5 - z[k], UNIFORM) for k in own}
         for k, (_, p) in log.sizes.items():
             name = problem.unknowns[k][0]
             value = float(values[0, log.model.parameters.index(name)])
-            gap = (p.null - value) / problem.scales[name].slope(value)
-            width[k] = gap, (WIDTH * gap) ** -2 if abs(gap) > TINY else TINY**-1
-            self.low[k], self.high[k] = min(self.low[k], z[k] + gap), max(self.high[k], z[k] + gap)
-        for k, (gap, precise) in width.items():
+            none = z[k] + (p.null - value) / problem.scales[name].slope(value)
+            self.low[k], self.high[k] = min(self.low[k], none), max(self.high[k], none)
+        for k in set(range(len(z))) - {*gaussian(log), *log.believed, *log.sizes}:
             precision[k, :] = precision[:, k] = 0.0
-            precision[k, k], step[k] = precise, gap
+            precision[k, k], step[k] = UNIFORM, 0.5 - z[k]
         return precision + bend, precision @ step - push
 
     def _solved(self, sums: np.ndarray, weight: np.ndarray) -> np.ndarray:

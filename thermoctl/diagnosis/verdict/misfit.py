@@ -22,7 +22,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted
-from thermoctl.diagnosis.evidence.levels import rounded, timing
+from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import Searched
@@ -133,11 +133,9 @@ def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[froz
     """Return the energies of all hypotheses.
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there. The
-    noise is the estimate of the leading hypothesis: a stated noise that is too large would hide the misfit.
-    Power beyond the stated noise at all frequencies is noise, too, as far as uncertain times may add it. A
+    noise is the estimate of the leading hypothesis: a stated noise that is too large would hide the misfit. A
     hypothesis has two refits (`as_refitted`). The one with less energy is used."""
-    leader = searched.tried[0].fitted
-    own = np.add(leader.average.sensor, timing(case, leader))
+    own = searched.tried[0].fitted.average.sensor
     noise = list(zip(own, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
