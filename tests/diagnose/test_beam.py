@@ -93,7 +93,7 @@ def test_a_rival_at_the_place_of_the_leading_effect_is_refitted_though_it_promis
             f = weighed("", reached[d.candidate.key]).fitted
             f.hypothesis.keys = frozenset([d.candidate.key])
             f.hypothesis.effects, f.absent, f.doubtful, f.log_likelihood = (d,), False, False, f.log_evidence
-            out.append([f])
+            out.append(f)
         return out
 
     monkeypatch.setattr(beam, "shortlist", lambda *a, **k: queue)

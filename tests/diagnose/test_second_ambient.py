@@ -10,7 +10,7 @@ from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import started
-from thermoctl.diagnosis.search.refits import followed
+from thermoctl.diagnosis.search.refits import refitted
 from thermoctl.diagnosis.search.screening import screened
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -34,6 +34,6 @@ def test_its_refit_starts_where_it_gains_what_the_screening_promised(seed):
     promise, found = next((p, d) for d, p in looked.promised if d.candidate.key == key)
     assert found.start["G"] > 0
     assert all(abs(found.start[f"B{k}"] - 21.0) < 30 for k in range(5))
-    refits = followed(known, null.fitted, looked, (found,), null.fitted)
-    gained = max(f.log_likelihood for f in refits) - null.fitted.log_likelihood
+    (f,) = refitted(known, null.fitted, looked, [((found,), promise)], null.fitted)
+    gained = f.log_likelihood - null.fitted.log_likelihood
     assert gained > 0.7 * promise > 5.0

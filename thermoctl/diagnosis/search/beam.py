@@ -102,13 +102,11 @@ class Search:
             if keys not in self.tried or w.score > self.tried[keys].score:
                 self.tried[keys] = w
 
-    def refuse(self, keys: Keys, fits: Sequence[Fitted]) -> None:
-        """Note that refits may be no hypotheses, and the likeliest that contains a simpler entry."""
-        self.refused[keys] = INSIGNIFICANT if fits else FAILED
-        there = (f for f in fits if not f.absent)
-        likeliest = max(there, key=lambda f: f.log_evidence, default=None)
-        if likeliest and any(e.candidate.effect.contains for e in likeliest.hypothesis.effects):
-            self.like[keys] = self.weighed(likeliest)
+    def refuse(self, keys: Keys, f: Fitted | None) -> None:
+        """Note that a refit may be no hypothesis, and keep one that contains a simpler entry."""
+        self.refused[keys] = INSIGNIFICANT if f else FAILED
+        if f and not f.absent and any(e.candidate.effect.contains for e in f.hypothesis.effects):
+            self.like[keys] = self.weighed(f)
 
     def extended(self, parent: Weighed) -> list[Weighed]:
         """Extend a hypothesis, once."""
@@ -378,18 +376,13 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         untried = (left + len(batch)) / len(queue)
         case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits, untried))
         case.budget.planned = case.budget.fits_done + left + len(batch)
-        for (added, gain), fits in zip(
-            batch, refitted(case, parent.fitted, looked, batch, leader), strict=True
-        ):
-            found = [f for f in fits if not f.absent]
-            best_gain = max((s.weighed(f).score for f in fits), default=-np.inf) - parent.score
-            ratio = max(ratio, best_gain / max(gain, 1.0)) if np.isfinite(gain) else ratio
-            keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-            s.refuse(keys, fits)
-            if found:
-                best = max(found, key=lambda f: f.log_evidence)
-                (doubtful if best.doubtful else out).append(s.weighed(best))
-            if any(f.absent or f.doubtful for f in fits):
+        for (added, gain), f in zip(batch, refitted(case, parent.fitted, looked, batch, leader), strict=True):
+            gained = s.weighed(f).score - parent.score if f else -np.inf
+            ratio = max(ratio, gained / max(gain, 1.0)) if np.isfinite(gain) else ratio
+            s.refuse(parent.fitted.hypothesis.keys | {d.candidate.key for d in added}, f)
+            if f and not f.absent:
+                (doubtful if f.doubtful else out).append(s.weighed(f))
+            if f and (f.absent or f.doubtful):
                 queued = {d.candidate.key for ds, _ in queue for d in ds}
                 more = simpler(added, gain, looked, where, limits)
                 queue += [x for x in more if x[0][0].candidate.key not in queued]

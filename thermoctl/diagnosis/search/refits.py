@@ -1,4 +1,4 @@
-"""Refits of a hypothesis with screened effects, from several starting points, in parallel.
+"""Refits of a hypothesis with screened effects, in parallel.
 
 Also the ranges of an effect's parameters in a refit, and its values there."""
 
@@ -16,41 +16,25 @@ from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.screen import sharpened
 from thermoctl.diagnosis.search.screening import Screened
-from thermoctl.diagnosis.search.shortlist import PAIR, Extension
+from thermoctl.diagnosis.search.shortlist import Extension
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
-# Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor. A
-# second refit starts there, because an axis that sticks rests for a long time.
+# Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor: an axis
+# that sticks rests for a long time.
 STICKING = 300.0
-WEAK = 0.1
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
 
 def refitted(
     case: Case, parent: Fitted, looked: Screened, batch: Sequence[Extension], leader: Fitted
-) -> list[list[Fitted]]:
-    """Refit a batch of extensions in parallel; return the refits of each."""
+) -> list[Fitted | None]:
+    """Refit the parent with each extension of a batch, in parallel; None where a refit fails."""
     starts = [tuple(sharpened(looked.metric, looked.rig, d) for d in added) for added, _ in batch]
-    return each(lambda first: followed(case, parent, looked, first, leader), starts)
-
-
-def followed(
-    case: Case, parent: Fitted, looked: Screened, first: Sequence[Direction], leader: Fitted
-) -> list[Fitted]:
-    """Refit the parent with the directions from several starting points, which depend on their shapes.
-
-    If every refit fits worse than the parent, start again from a weaker effect."""
-    stuck = tuple(sticking(d) or d for d in first)
-    found = [_refitted(case, parent, first, looked, leader)]
-    if stuck != first and max(d.gain for d in first) > looked.promised[0][0].gain / PAIR:
-        found.append(_refitted(case, parent, stuck, looked, leader))
-    if all(f is None or f.rough.cost > parent.rough.cost for f in found):
-        found.append(_refitted(case, parent, tuple(weaker(d) for d in first), looked, leader))
-    return [f for f in found if f is not None]
+    return each(lambda added: _refitted(case, parent, added, looked, leader), starts)
 
 
 def _refitted(
@@ -121,28 +105,6 @@ def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | No
         return value / 100, value * 100
     reach = 30 * max(abs(value - p.null), 1e-3 * abs(p.null), 1e-12)
     return max(p.low, p.null - reach), min(p.high, p.null + reach)
-
-
-def weaker(direction: Direction) -> Direction:
-    """Return the direction with a refit that starts at the share WEAK of its size."""
-    effect, start = direction.candidate.effect, dict(direction.start)
-    for p in effect.parameters:
-        if p.fades(effect.shapes):
-            start[p.name] = p.null + WEAK * (start[p.name] - p.null)
-    return dataclasses.replace(direction, start=start)
-
-
-def sticking(direction: Direction) -> Direction | None:
-    """Return the direction with a start at friction that sticks; None for an effect without creep.
-
-    A refit that starts at a faster creep does not find such friction."""
-    effect = direction.candidate.effect
-    start = {
-        p.name: direction.start[p.name] / STICKING
-        for p in effect.parameters
-        if effect.shapes.get(p.shape or "") == "creep_speeds"
-    }
-    return dataclasses.replace(direction, start={**direction.start, **start}) if start else None
 
 
 def extend(direction: Direction) -> tuple[Plant, dict[str, str]]:
