@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from tests.concealed import generate, sensors
-from tests.concealed.judge import snr
+from tests.concealed.judge import size_for, snr
 from tests.concealed.rig import Scene
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.diagnosis import run as diagnosis
@@ -87,7 +87,7 @@ def conceal(
         raise RuntimeError(f"no rig of 400 has a place for {story.effect} at {story.where}")
     bench = generate.Bench(scene, rng)
     bench.measure(held)
-    size = generate._size_for(bench.curve[0], min(SIGMAS, 0.95 * float(np.max(snr(bench.curve[0][2])))))
+    size = size_for(bench.curve[0], min(SIGMAS, 0.95 * float(np.max(snr(bench.curve[0][2])))))
     effect = (story.effect, story.where, held[0].make(size))
     true = bench.readings([effect])
     left = bench.refit(true)

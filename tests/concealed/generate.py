@@ -27,7 +27,8 @@ from scipy.linalg import qr
 from scipy.optimize import least_squares
 
 from tests.concealed import sensors
-from tests.concealed.judge import BANDS, TELL_APART, Judge, beyond, snr
+from tests.concealed.crowded import as_real, crowd
+from tests.concealed.judge import BANDS, TELL_APART, Judge, beyond, size_for, snr
 from tests.concealed.open_world import jittered, open_world, with_world
 from tests.concealed.rig import Scene, Suspect
 from tests.concealed.rigs_motion import Flexure, FreeStage
@@ -45,6 +46,7 @@ SIZES = 10.0 ** np.arange(-2.0, 1.51, 0.5)
 _PERIOD = "one none one one none one one unknown one none one pair one one none one one unknown one none "
 _PERIOD += "one one pair one none one one none one none one unknown one one none one cancel one none one"
 KINDS = tuple(_PERIOD.split())
+CROWDED = "crowded"  # a kind that no set of its own accord holds
 ATTEMPTS = 24
 STEP = 2e-4  # of a parameter's range, for the derivatives by which a refit is judged
 CONVERGED = 1e-3  # of an honest refit: relative change of its sum of squares, and of its unknowns
@@ -221,9 +223,13 @@ class Bench:
         )
         return np.append(left[tuple(found.x)][:-free], -found.x)
 
-    def beyond_rivals(self, signals: list[np.ndarray], onsets: int = 1) -> list[list[tuple[Suspect, float]]]:
+    def beyond_rivals(
+        self, signals: list[np.ndarray], onsets: int = 1, beside: Sequence[np.ndarray] = ()
+    ) -> list[list[tuple[Suspect, float]]]:
         """For each left-over signal (M,): every suspect of the rig at a place, and what it would leave of the signal.
-        More than one of `onsets`: what begins at some time is tried from that many times."""
+        More than one of `onsets`: what begins at some time is tried from that many times. `beside`: for each signal, rows
+        (k, M) of effects that are fitted as well."""
+        beside = beside or [np.zeros((0, len(signals[0])))] * len(signals)
         found: list[list[tuple[Suspect, float]]] = [[] for _ in signals]
         rivals = list(self.scene.suspects)
         if onsets > 1:
@@ -240,8 +246,9 @@ class Bench:
             d = [self.scene.changes_of(k, [Variant(), *rows], True) for k in range(len(self.scene.runs))]
             left = self.judge.left_over(self.judge.whiten(d))
             for i, s in enumerate(part):
-                for row, signal in zip(found, signals, strict=True):
-                    row.append((s, beyond(signal, left[2 * i : 2 * i + 2])))
+                own = left[2 * i : 2 * i + 2]
+                for row, signal, others in zip(found, signals, beside, strict=True):
+                    row.append((s, beyond(signal, np.concatenate([own, others]))))
         return found
 
     def readings(self, effects: list[tuple[str, str, dict]]) -> list[np.ndarray]:
@@ -267,19 +274,6 @@ def _alike(rivals: list[tuple[Suspect, float]], truth: Suspect) -> list[tuple[st
         for s, stays in rivals
         if (s.effect, s.where) != (truth.effect, truth.where) and stays < TELL_APART
     ]
-
-
-def _size_for(curve: tuple, target: float) -> float | None:
-    """The size at which the left-over SNR is `target`; None where the effect cannot be that visible."""
-    suspect, sizes, left = curve
-    s = snr(left)
-    if not np.all(np.isfinite(s)) or s.max() < target:
-        return None
-    k = int(np.argmax(s >= target))
-    if k == 0:
-        return float(sizes[0] * target / s[0]) if suspect.top > 1 else float(sizes[0])
-    x = np.interp(np.log(target), np.log(s[k - 1 : k + 1] + 1e-12), np.log(sizes[k - 1 : k + 1]))
-    return float(np.exp(x))
 
 
 def make_case(
@@ -308,6 +302,8 @@ def make_case(
             scene = FAMILIES[family].scene(
                 np.random.default_rng([seed, number, attempt, 1]), schedule, short, vigour
             )
+            if slot.kind == CROWDED:
+                scene = as_real(scene, rng)
             case, seen = _conceal(scene, slot, np.random.default_rng([seed, number, attempt, 2]))
             if case is not None or not seen:
                 break
@@ -329,6 +325,8 @@ def make_case(
         opened = open_world(
             scene, bench, effects, runs, signal, np.random.default_rng([seed, number, attempt, 3])
         )
+    opened = told.get("opened", opened)
+    if opened is not None:
         scene, runs = with_world(scene, opened), opened.runs
     answer = {
         "verdict": "consistent" if kind == "none" else "unexplained" if kind == "unknown" else "explained",
@@ -403,6 +401,8 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
     bench = Bench(scene, rng)
     kind = slot.kind
     told: dict = {"alike": [], "band": None, "snr": [], "onset": None, "aliases": []}
+    if kind == CROWDED:
+        return crowd(bench, rng, told), None
     if kind == "none":
         return ([], bench.readings([]), told, bench), None
     pool = scene.unknowns if kind == "unknown" else scene.suspects
@@ -420,7 +420,7 @@ def _conceal(scene: Scene, slot: Slot, rng: np.random.Generator) -> tuple[tuple 
     seen = None
     for curve in bench.curve:
         target = float(np.exp(rng.uniform(np.log(low * 1.1), np.log(high * 0.9))))
-        size = _size_for(curve, target)
+        size = size_for(curve, target)
         s = curve[0]
         if size is None:
             seen = float(np.max(snr(curve[2])))
@@ -461,7 +461,7 @@ def _two(bench: Bench, kind: str, rng: np.random.Generator, told: dict):
         for second in bench.curve[i + 1 :]:
             if first[0].onset and second[0].onset:
                 continue
-            sizes = [_size_for(c, rng.uniform(18, 50)) for c in (first, second)]
+            sizes = [size_for(c, rng.uniform(18, 50)) for c in (first, second)]
             if None in sizes:
                 continue
             a, b = (
@@ -601,7 +601,7 @@ def main(argv: list[str] | None = None) -> int:
         default="closed",
         help="open: with small misfits that nobody will name; both: every second case",
     )
-    p.add_argument("--kind", choices=sorted(set(KINDS)), help="only cases of this kind")
+    p.add_argument("--kind", choices=sorted({*KINDS, CROWDED}), help="only cases of this kind")
     a = p.parse_args(argv)
     inside = a.answers == "inside"
     answers = a.out.parent / f"{a.out.name}_answers" if a.answers is None else Path(a.answers)

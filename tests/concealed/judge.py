@@ -61,11 +61,18 @@ class Judge:
         inner = np.linalg.solve(self.solve, c.T).T
         return np.concatenate([d - c @ self.basis, -inner], axis=1)
 
+    def _squares(self, left: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+        """Squares of one left-over signal (M + np,) by run (N, ny), and the part that carries the ridge (np,)."""
+        *runs, ridge = np.split(left, np.cumsum([s.size for s in self.spectra]))
+        return [r.reshape(s.shape) ** 2 for r, s in zip(runs, self.spectra, strict=True)], ridge
+
+    def errors(self, left: np.ndarray) -> np.ndarray:
+        """Rms over the noise (ny,) of one left-over signal (M + np,)."""
+        return np.sqrt(np.concatenate(self._squares(left)[0]).mean(axis=0))
+
     def learnt(self, left: np.ndarray) -> float:
         """SNR of one left-over signal (M + np,) for a test that has to learn the noise of each channel."""
-        ends = np.cumsum([s.size for s in self.spectra])
-        *runs, ridge = np.split(left, ends)
-        parts = [r.reshape(s.shape) ** 2 for r, s in zip(runs, self.spectra, strict=True)]
+        parts, ridge = self._squares(left)
         channels = range(self.spectra[0].shape[1])
         square = sum(_learnt([s[:, j] for s in self.spectra], [p[:, j] for p in parts]) for j in channels)
         return float(np.sqrt(square + ridge @ ridge))
@@ -97,7 +104,25 @@ def snr(left: np.ndarray) -> np.ndarray:
     return np.linalg.norm(left, axis=-1)
 
 
+def apart(left: np.ndarray, rival: np.ndarray) -> np.ndarray:
+    """One signal (M,) without what the rival's rows (k, M) explain of it."""
+    q, _ = np.linalg.qr(rival[snr(rival) > 1e-9].T)
+    return left - q @ (q.T @ left)
+
+
 def beyond(left: np.ndarray, rival: np.ndarray) -> float:
     """What is left of one signal (M,) after the rival's rows (k, M) are fitted to it as well."""
-    q, _ = np.linalg.qr(rival[snr(rival) > 1e-9].T)
-    return float(np.linalg.norm(left - q @ (q.T @ left)))
+    return float(np.linalg.norm(apart(left, rival)))
+
+
+def size_for(curve: tuple, target: float) -> float | None:
+    """The size at which the left-over SNR is `target`; None where the effect cannot be that visible."""
+    suspect, sizes, left = curve
+    s = snr(left)
+    if not np.all(np.isfinite(s)) or s.max() < target:
+        return None
+    k = int(np.argmax(s >= target))
+    if k == 0:
+        return float(sizes[0] * target / s[0]) if suspect.top > 1 else float(sizes[0])
+    x = np.interp(np.log(target), np.log(s[k - 1 : k + 1] + 1e-12), np.log(sizes[k - 1 : k + 1]))
+    return float(np.exp(x))

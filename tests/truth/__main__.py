@@ -1,6 +1,6 @@
 """Judge the diagnosis on frozen cases: make (once), diagnose, compare with an older result.
 
-    python -m tests.truth [--number 60] [--seed S] [--form coarse] [--old FILE] [--keep FILE] [--only home,foreign,closed,open]
+    python -m tests.truth [--number 60] [--seed S] [--form coarse] [--old FILE] [--keep FILE] [--only home,foreign,closed,open,crowded]
 
 OUT/result.json holds the result. A diagnosis is kept for the same case and the same program: run it again to
 continue. docs/proof/truth.md shows what this prints.
@@ -30,7 +30,9 @@ GROUPS = {
     "foreign": "other people's systems",
     "closed": "generated, closed world",
     "open": "generated, open world",
+    "crowded": "generated, crowded",
 }
+USUAL = "home,foreign,closed,open"
 
 
 def say(line: str) -> None:
@@ -42,10 +44,9 @@ def cases(a: argparse.Namespace) -> list[Case]:
     """Return the asked cases; the longest rigs first, so that no process is left with one at the end."""
     wanted = a.only.split(",")
     found = [*(home(say) if "home" in wanted else ()), *(foreign(say) if "foreign" in wanted else ())]
-    if {"closed", "open"} & set(wanted):
-        made = generated(a.out / "cases", (a.number + 1) // 2, a.workers, say, a.seed, a.form)
-        found += [c for c in made if c.group in wanted]
-    return found
+    numbers = {"closed": (a.number + 1) // 2, "open": (a.number + 1) // 2, "crowded": a.number * 2 // 3}
+    numbers = {world: number for world, number in numbers.items() if world in wanted}
+    return found + generated(a.out / "cases", numbers, a.workers, say, a.seed, a.form)
 
 
 def judged(found: Sequence[Case], out: Path, workers: int) -> dict[str, Row]:
@@ -94,10 +95,15 @@ def write(rows: Mapping[str, Row], *files: Path) -> dict[str, Any]:
 
 def options(p: argparse.ArgumentParser) -> None:
     """Add the options that choose the cases."""
-    p.add_argument("--number", type=int, default=60, help="generated cases, half of each world (default 60)")
+    p.add_argument(
+        "--number",
+        type=int,
+        default=60,
+        help="generated cases, half of each world; crowded ones: two thirds of it",
+    )
     p.add_argument("--seed", type=int, help="other generated cases: those of this seed, in both worlds")
     p.add_argument("--form", choices=FORMS, help="generated cases in another form (tests/truth/forms.py)")
-    p.add_argument("--only", default=",".join(GROUPS), help="groups of cases (default: all)")
+    p.add_argument("--only", default=USUAL, help=f"groups of cases (default: {USUAL}; crowded)")
     p.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     p.add_argument(
         "--out", type=Path, default=Path("build/truth"), help="folder of the cases and their diagnoses"

@@ -1,6 +1,6 @@
 """What each rule on the way to a name is worth: the cases of `make truth`, decided without it.
 
-    python -m tests.truth.ablate [--number 60] [--only home,foreign,closed,open] [--search] [RULE...]
+    python -m tests.truth.ablate [--number 60] [--only home,foreign,closed,open,crowded] [--search] [RULE...]
 
 RULES is the list of all rules that decide. A rule of the decision is left out of the searches that
 `make truth` kept, in a minute; one of the search (--search) needs new searches. Prints, for each rule and

@@ -1,7 +1,7 @@
 """The cases by which a diagnosis is judged, each with what is right, tolerated and wrong in it.
 
-- generated: the first cases of two frozen seeds, closed and open world; made once, kept by the generator's
-  hash
+- generated: the first cases of frozen seeds, of the closed and the open world, and of a crowded one only if
+  asked (tests/concealed/crowded.py); made once, kept by the generator's hash
 - home: the rigs of THERMOCTL_RECORDINGS (tests/proof/rigs.py)
 - foreign: the systems of THERMOCTL_FOREIGN, a folder of folders with plant.yaml, recordings and answer.yaml
 """
@@ -24,7 +24,8 @@ from tests.truth.forms import changed
 from thermoctl.files.yamlfile import load
 from thermoctl.fleet.jobs import Job
 
-SEEDS = {"closed": 141421, "open": 173205}  # frozen: a table stays comparable with an older one
+# frozen: a table stays comparable with an older one
+SEEDS = {"closed": 141421, "open": 173205, "crowded": 223606}
 FOREIGN = "THERMOCTL_FOREIGN"  # of the environment: the folder of other people's systems
 RIGHT, TOLERATED, STRAY = "right", "tolerated", "stray"
 
@@ -51,21 +52,20 @@ class Case:
 
 def generated(
     folder: Path,
-    number: int,
+    numbers: Mapping[str, int],
     workers: int,
     say: Callable[[str], None],
     seed: int | None = None,
     form: str | None = None,
 ) -> list[Case]:
-    """Return the first `number` cases of each world, of its frozen seed or of `seed`, in a form of FORMS.
+    """Return the first cases of each world in `numbers`, of its frozen seed or of `seed`, in a form of FORMS.
 
     Those that are not there are made."""
     root = folder / (_generator() if seed is None else f"{_generator()}-{seed}")
-    seeds = SEEDS if seed is None else dict.fromkeys(SEEDS, seed)
+    asked = [(world, n) for world, number in numbers.items() for n in range(number)]
     todo = [
         (world, n)
-        for n in range(number)
-        for world in seeds
+        for world, n in asked
         if not (root / world / f"{n + 1:04d}" / "answer.yaml").exists()
         and not (root / world / f"{n + 1:04d}.gap").exists()
     ]
@@ -73,17 +73,19 @@ def generated(
         say(f"{len(todo)} cases to make")
         with ProcessPoolExecutor(min(workers, len(todo))) as pool:
             for done in as_completed(
-                [pool.submit(_make, root / world, seeds[world], world, n) for world, n in todo]
+                [
+                    pool.submit(_make, root / world, SEEDS[world] if seed is None else seed, world, n)
+                    for world, n in todo
+                ]
             ):
                 say(done.result())
     found = []
     mark = "".join(f"-{x}" for x in (seed, form) if x is not None)
-    for world in seeds:
-        for n in range(number):
-            case = root / world / f"{n + 1:04d}"
-            if (case / "answer.yaml").exists():
-                name = f"{world}{mark}-{case.name}"
-                found.append(_generated(world, name, changed(case, form) if form else case))
+    for world, n in asked:
+        case = root / world / f"{n + 1:04d}"
+        if (case / "answer.yaml").exists():
+            name = f"{world}{mark}-{case.name}"
+            found.append(_generated(world, name, changed(case, form) if form else case))
     return found
 
 
@@ -96,7 +98,8 @@ def _generator() -> str:
 
 def _make(folder: Path, seed: int, world: str, number: int) -> str:
     name = f"{number + 1:04d}"
-    words = f"--seed {seed} --world {world} --first {number} --number 1 --answers inside".split()
+    kind = "--kind crowded" if world == "crowded" else f"--world {world}"
+    words = f"--seed {seed} {kind} --first {number} --number 1 --answers inside".split()
     generate.main(["--out", str(folder), *words])
     if not (folder / name / "answer.yaml").exists():  # no rig shows the effect at that size
         (folder / f"{name}.gap").touch()
@@ -112,7 +115,15 @@ def _generated(world: str, name: str, folder: Path) -> Case:
         """Return the test of a name for being this true effect, or one that the data cannot tell from it, at its place."""
         return lambda name: truth.names(name, true) and truth.at(name)
 
-    return Case(world, _job(name, folder), answer, tuple(map(is_it, known)), truth.of_misfit)
+    wanted = tuple(map(is_it, known))
+    if "each" in answer:  # of each effect, all names that the data cannot tell from it
+        wanted = tuple(_one_of([(e, w) for e, w in names]) for names in answer["each"])
+    return Case(world, _job(name, folder), answer, wanted, truth.of_misfit)
+
+
+def _one_of(names: Sequence[Named]) -> Callable[[Named], bool]:
+    """Return the test of a name for being one of these effects at its place."""
+    return lambda name: any(name[0] == e and same_place(e, name[1], where) for e, where in names)
 
 
 def _job(name: str, folder: Path, held_out: tuple[str, ...] = ()) -> Job:
@@ -149,11 +160,7 @@ def foreign(say: Callable[[str], None]) -> list[Case]:
 def _foreign(folder: Path) -> Case:
     answer = load(folder / "answer.yaml").plain()
 
-    def is_it(effects: Sequence[str], where: str) -> Callable[[Named], bool]:
-        """Return the test of a name for being one of these effects at this place."""
-        return lambda name: name[0] in effects and same_place(name[0], name[1], where)
-
-    wanted = tuple(is_it(_list(effects), where) for effects, where in answer["named"])
+    wanted = tuple(_one_of([(e, where) for e in _list(effects)]) for effects, where in answer["named"])
     return Case(
         "foreign", _job(folder.name, folder, tuple(_list(answer.get("held_out", [])))), answer, wanted
     )
