@@ -6,6 +6,7 @@ The ranges are those of the 24 diagnoses of real rigs in tests/proof/rigs.py, de
                          half of their power in 2 to 50 of the first DCT bins of a thermal record, some hundreds where axes move
     a right effect       removes 1.0, 1.4, 2.4, 4.1 and 7.1 times the rms of the misfit that stays (10, 25, 50, 75, 90 %)
     one recording        in 17 of 24; an event (what depends on the time itself) among 1 of 34 effects
+    rows                 121 to 24 840, median 1430: records are the short ones of the families
 
 The misfits are those of the open world that have no name in the catalogue, and the families' physics outside it, small.
 """

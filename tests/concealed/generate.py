@@ -300,7 +300,10 @@ def make_case(
         vigour = 1.0
         for _ in range(4 if slot.effect in FIXED else 1):
             scene = FAMILIES[family].scene(
-                np.random.default_rng([seed, number, attempt, 1]), schedule, short, vigour
+                np.random.default_rng([seed, number, attempt, 1]),
+                schedule,
+                short or slot.kind == CROWDED,
+                vigour,
             )
             if slot.kind == CROWDED:
                 scene = as_real(scene, rng)
