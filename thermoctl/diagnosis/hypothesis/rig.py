@@ -191,12 +191,20 @@ class Rig:
             for f in self.physics.flows.values():
                 ends = {e for e in (f.source, f.target) if e in self.temperatures}
                 if len(ends) == 1 and ends <= ex.names(f.rate):
-                    for i in ex.names(f.rate) & count.keys():
+                    for i in self._read_in(f.rate) & count.keys():
                         count[i] += 1
             count = {i: n for i, n in count.items() if n or i in stated}
             if count:
                 return count
         return {}
+
+    def _read_in(self, e: ex.Expr) -> set[str]:
+        """Return the names in an expression, and those that the slow readings among them follow."""
+        found = set(ex.names(e))
+        slow = [
+            f.rate for f in self.physics.flows.values() if f.target in found and _READINGS.match(f.target)
+        ]
+        return found.union(*map(ex.names, slow))
 
     def _mean(self, signal: str) -> float:
         if signal in self.plant.parameters:
