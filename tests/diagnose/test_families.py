@@ -42,6 +42,13 @@ def test_beside_a_name_its_relatives_are_none():
     assert of([((DRY,), 5.0), ((DRY, STRIBECK), 4.0)], named=[DRY]) == ()
 
 
+def test_a_relative_that_is_named_at_another_place_hides_no_family():
+    """Two readings are late, one by a lag for sure, the other by a lag or a delay."""
+    lag, delay = ("sensor_lag", "w"), ("sensor_delay", "w")
+    (family,) = of([((LAG, lag), 0.0), ((LAG, delay), -0.4)], named=[LAG])
+    assert set(family.members) == {lag, delay}
+
+
 def test_two_hypotheses_that_share_a_name_and_differ_in_a_relative():
     (family,) = of([((LAG, DRY), 0.0), ((LAG, STRIBECK), 0.0)], named=[LAG])
     assert set(family.members) == {DRY, STRIBECK}

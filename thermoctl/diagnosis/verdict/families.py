@@ -33,9 +33,10 @@ def families(
 ) -> tuple[Family, ...]:
     """Return the families of which one effect is there with probability `name` or more.
 
-    A family is all effects that are related to its likeliest member: two or more, none of them `named` or
-    related to one that is. `physics`: probability that an effect of a hypothesis is no misfit. `asked`: for
-    the effects that were tested, the probability that they predict data that they were not fitted to."""
+    A family is all effects that are related to its likeliest member: two or more. None of them is `named`, or
+    related to an effect that is named at the same place. `physics`: probability that an effect of a
+    hypothesis is no misfit. `asked`: for the effects that were tested, the probability that they predict
+    data that they were not fitted to."""
     likely = sorted(
         (k for k, p in posterior.effects.items() if p >= MEMBER), key=lambda k: (-posterior.effects[k], k)
     )
@@ -44,7 +45,8 @@ def families(
     while open_:
         members = tuple(k for k in open_ if k == open_[0] or related(k, open_[0], entries))
         open_ = [k for k in open_ if k not in members]
-        if len(members) < 2 or any(related(k, members[0], entries) for k in named):
+        first = members[0]
+        if len(members) < 2 or any(k[1] == first[1] and related(k, first, entries) for k in named):
             continue
         p = sum(
             q * max((physics[keys][k] for k in members if k in keys), default=0.0)
