@@ -158,6 +158,11 @@ RULES: Mapping[str, Rule] = {
     "mistakes": Rule(
         "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True
     ),
+    "observer": Rule(
+        "a rig that drifts is searched with an observer, too",
+        {"search.beam.with_observer": _no},
+        searches=True,
+    ),
     "surplus": Rule(
         "an extension with an insignificant part is kept from 5 nats over the others",
         {"search.beam.SURPLUS": float("inf")},

@@ -22,6 +22,7 @@ from thermoctl.units import dimension
 if TYPE_CHECKING:
     from thermoctl.plant.simulation.simulate import Excitation
 
+SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
 STRAIGHT = "_straight"  # suffix of the linearly interpolated copy of a held input
 KELVIN = {"K", "kelvin"}
 ZERO_DEGC = 273.15  # K
@@ -106,7 +107,7 @@ def _motions(plant: Plant) -> dict[str, str]:
 class Rig:
     """A plant and its recordings, with the kinds of its quantities.
 
-    - `physics`: the plant without the inputs that effects of readings added
+    - `physics`: the plant without the parts that an observer and effects of readings added
     - `pairs`: by velocity, its position, where the structure of the plant shows it; `position_of`: these, and
       the pairs that units show
     - `temperatures`, `velocities`: nodes; `heat_inputs`: inputs that are temperatures
@@ -119,7 +120,11 @@ class Rig:
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
         self._jumps: dict[str, float] = {}  # by column
         self.physics = p = dataclasses.replace(
-            plant, inputs={k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT)}
+            plant,
+            inputs={
+                k: v for k, v in plant.inputs.items() if not k.endswith(STRAIGHT) and not k.startswith(SEEN)
+            },
+            flows={k: v for k, v in plant.flows.items() if not k.startswith(CORRECT)},
         )
         self.pairs = _motions(plant)
         self.temperatures = [

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.data.memory import PlacedBefore
-from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted, placed_before
+from thermoctl.diagnosis.data.case import Budget, Case
+from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
+from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates
@@ -19,11 +19,13 @@ from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
+from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
 from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, shortlist, simpler
 from thermoctl.files.yamlfile import InputError
+from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
@@ -132,7 +134,8 @@ class Search:
 def search(case: Case, limits: Thresholds) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
-    Wrong numbers of the plant file are rivals."""
+    Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
+    searched with an observer, too."""
     s = started(case, limits)
     null = s.best
     rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
@@ -141,6 +144,9 @@ def search(case: Case, limits: Thresholds) -> Searched:
         s.extended(null)  # also where a rival fits better
     grow(s)
     swap(s)
+    if with_observer(s):
+        grow(s)
+        swap(s)
     return searched(s)
 
 
@@ -213,7 +219,7 @@ def swap(s: Search) -> None:
             rest = tuple(o for o in effects if o is not e)
             if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
                 continue
-            parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted)
+            parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
             if parent is None:
                 continue
             if not parent.fitted.doubtful:
@@ -225,21 +231,25 @@ def swap(s: Search) -> None:
             return
 
 
-def rebuilt(s: Search, effects: Sequence[Placed], best: Fitted) -> Weighed | None:
-    """Refit the case's plant with some effects of the best hypothesis; None where this fails.
+def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
+    """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails.
 
-    It starts at the values of the best. It fails for a law: the catalogue has no place for it."""
-    case, known = s.case, best.rough_plant
+    It fails for a law: the catalogue has no place for it."""
+    case, known = s.case, values.rough_plant
     if any(e.key[0] not in case.catalogue for e in effects):
         return None
     parameters = {n: known.parameters.get(n, p) for n, p in case.plant.parameters.items()}
     plant = dataclasses.replace(case.plant, parameters=parameters)
     entries = {e.key[0]: e.candidate.effect for e in effects}
-    return remade(s, placed_before(effects, known), plant, entries, best)
+    return remade(s, placed_before(effects, known), plant, entries, leader)
 
 
 def remade(
-    s: Search, effects: Sequence[PlacedBefore], plant: Plant, entries: Mapping[str, Effect], leader: Fitted
+    s: Search,
+    effects: Sequence[PlacedBefore],
+    plant: Plant,
+    entries: Mapping[str, Effect],
+    leader: Fitted | None,
 ) -> Weighed | None:
     """Refit a plant with effects of an earlier hypothesis, from their values; None where this fails.
 
@@ -258,6 +268,48 @@ def remade(
         return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
     except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
         return None
+
+
+def with_observer(s: Search) -> bool:
+    """Search with a plant that follows its recordings, and refit its best hypotheses in the free run.
+
+    Only for a rig that drifts: there a free run from a wrong hypothesis leads no refit to the right one.
+    Return whether a hypothesis was found that the search had not."""
+    case = s.case
+    drives = case.drives(case.null.model)
+    about = linear(case.null, drives)
+    if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
+        return False
+    if only_noise(case, as_refitted(case, s.best.fitted), s.limits):
+        return False
+    known = len(s.tried)
+    for trust in TRUSTS:
+        plant = held(case.plant, about, case.noise, float(np.median(np.diff(drives[0].t))), trust)
+        if plant is None:
+            break
+        try:
+            following = _following(s, plant)
+        except (SimulationError, InputError, np.linalg.LinAlgError):
+            continue  # the plant with an observer cannot be simulated: the free search stands
+        for w in leaders(list(following.tried.values()), s.limits):
+            effects = w.fitted.hypothesis.effects
+            free = rebuilt(s, effects, w.fitted, None) if effects else None
+            if free and not free.fitted.absent:
+                s.keep([free])
+        if len(s.tried) > known:
+            break
+    return len(s.tried) > known
+
+
+def _following(s: Search, plant: Plant) -> Search:
+    """Return a search with a plant that follows its recordings. Raises SimulationError."""
+    case, model = s.case, compile_plant(plant)
+    null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
+    budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+    own = dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING)
+    following = started(own, s.limits)
+    grow(following)
+    return following
 
 
 def recall(s: Search) -> None:
