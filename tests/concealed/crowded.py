@@ -2,11 +2,12 @@
 
 The ranges are those of the 24 diagnoses of real rigs in tests/proof/rigs.py, decided from their searches at e1915c0d:
 
-    errors that stay     rms 1.1 to 23 times the noise of all but two sensors, of half of them 2.0 to 6.7 times (median 4.2);
-                         half of their power in 2 to 50 of the first DCT bins of a thermal record, some hundreds where axes move
-    a right effect       removes 1.0, 1.4, 2.4, 4.1 and 7.1 times the rms of the misfit that stays (10, 25, 50, 75, 90 %)
-    one recording        in 17 of 24; an event (what depends on the time itself) among 1 of 34 effects
-    rows                 121 to 24 840, median 1430: records are the short ones of the families
+- errors that stay: rms 1.1 to 23 times the noise of all but two sensors, of half of them 2.0 to 6.7 times (median 4.2)
+- where half of their power lies: in the first 2 to 50 DCT bins of a thermal record, in some hundreds where axes move
+- what a right effect removes: 1.0, 1.4, 2.4, 4.1 and 7.1 times the rms of the misfit that stays (10, 25, 50, 75, 90 %)
+- one recording: in 17 of 24
+- events, effects that depend on the time itself: 1 of 34
+- rows: 121 to 24 840, median 1430. Records are the short ones of the families
 
 The misfits are those of the open world that have no name in the catalogue, and the families' physics outside it, small.
 """
@@ -146,8 +147,9 @@ def _misfits(scene: Scene, rng: np.random.Generator) -> list[Misfit]:
 
 
 def _sized(bench, misfits: list[Misfit], rows: np.ndarray, error: float) -> tuple[float, np.ndarray]:
-    """The misfits' size for which their errors beside the effects' `rows` (k, M + np) are nearest to `error` times the noise
-    at the worst output, and the signal (M + np,) that stays of them."""
+    """The misfits' size, and the signal (M + np,) that stays of them beside the effects' `rows` (k, M + np).
+
+    At this size their errors are nearest to `error` times the noise at the worst output."""
     size = then = 1.0
     for _ in range(STEPS):
         size = then

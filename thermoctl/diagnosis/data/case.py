@@ -137,12 +137,12 @@ def _start(d: Excitation, null: Model, model: Model) -> np.ndarray | None:
     if the plant states the same initial value for both. NaN stands for the plant's initial value."""
     if d.x0 is None:
         return None
-    plant = model.plant
+    plant, by_null, by_model = model.plant, direct_outputs(null.plant), direct_outputs(model.plant)
 
     def start(state: str) -> float:
         """Return the start of one state."""
         known = state in null.states
-        read = direct_outputs(null.plant if known else plant).get(state, "")
+        read = (by_null if known else by_model).get(state, "")
         if known or read in d.first:
             return d.first.get(read, np.nan)
         ends = ({f.source, f.target} for f in plant.flows.values())
