@@ -71,6 +71,8 @@ def test_good_file_survives_a_round_trip():
         (("flows", "loss", "rate"), "G * (T - air", ")"),
         (("flows", "loss", "rate"), "", ""),
         (("flows", "loss", "rate"), "G * delay(T, 3)", "delay"),
+        (("outputs", "y", "value"), "delay(T, -3)", "reach -3; 0 at least"),
+        (("outputs", "y", "value"), "delay(T, C - 50)", "reach -30; 0 at least"),  # at the lower bound of C
         (("flows", "loss", "rate"), "G * first(air)", "first"),
         (("flows", "loss", "rate"), "__import__('os').system('true')", "'"),
         (("flows", "loss", "rate"), "T.__class__", "."),

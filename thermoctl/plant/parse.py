@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 from thermoctl.files.yamlfile import Node as YamlNode
 from thermoctl.files.yamlfile import Section, kind_of, number_of, suggest
@@ -353,6 +354,19 @@ def _check_delay(e: Expr, p: _Place, plant: Plant) -> None:
         )
     if p.delays == "inputs" and not ex.names(signal) <= set(plant.inputs):
         raise p.node.error(f"{p.what}: delay() in a rate may read inputs only")
+    if not (least := _least(seconds, plant)) >= 0:
+        raise p.node.error(
+            f"{p.what}: the seconds of delay() reach {least:g}; 0 at least was expected, over the whole range of a parameter"
+        )
+
+
+def _least(seconds: Expr, plant: Plant) -> float:
+    """Return the least value of an expression at the least and largest values of its parameters."""
+    used = [plant.parameters[n] for n in sorted(ex.names(seconds))]
+    ends = [(p.value, *(p.range or ()), *p.values.values()) for p in used]
+    ends = [(min(v), max(v)) for v in ends]
+    found = (ex.evaluate(seconds, dict(zip([p.name for p in used], v, strict=True))) for v in product(*ends))
+    return float(min(found))
 
 
 def _check_use(plant: Plant, items: Items) -> None:
