@@ -304,6 +304,18 @@ CASES = (
          {"T: Temperature": RISING, "P: Pressure": POWER}, units={"T: Temperature": "degC", "P: Pressure": "bar"}),
     Case("Origin, names, units, comments", "origin.txt", rows("Time\tT\tP\ns\tdegC\tW\nrun 1\tblock\theater\n", "{i}\t{T}\t{P}"), {"T": RISING, "P": POWER}, units={"T": "degC", "P": "W"}),
     Case("gzip of a CSV", "run.csv.gz", gzip.compress(rows("time [s],T,P\n", "{i},{T},{P}").encode()), {"T": RISING, "P": POWER}),
+    Case("LabVIEW LVM, a header a segment", "segments.lvm", "LabVIEW Measurement\t\nMulti_Headings\tYes\n***End_of_Header***\t\n\t\n" + "\t\n".join(
+            f"Channels\t1\nSamples\t3\nX0\t{k}\nDelta_X\t1\n***End_of_Header***\t\nX_Value\tT\tComment\n" + "".join(f"{i}\t{20 + i}\t\n" for i in range(k, k + 3)) for k in (0, 3)),
+         {"T": RISING}),
+    Case("Multimeter that changes its range", "dmm.csv", rows("No,Time,Value,Unit,Mode\n", "{i},10:00:{s},{T},VDC,AUTO", 5, "6,10:00:05,25000,mVDC,AUTO\n"), {"Value": RISING}, units={"Value": "V"}),
+    Case("Keysight 34465A, overload", "dmm2.csv", rows("Sample,Time (s),Reading\n", "{i},{i}.0E+00,+{T}.0E+00", 5, "5,5.0,+9.90000000E+37\n"), {"Reading": [*RISING[:5], np.nan]}),
+    Case("Graphtec GL, out of range", "over.csv", rows("Number,Date&Time,CH1,CH2\n", "{i}," + DATE + " 10:00:{s},+  {T}.0,+  1.5", 5, "6," + DATE + " 10:00:05,+++++++,-------\n"),
+         {"CH1": [*RISING[:5], np.nan], "CH2": [1.5] * 5 + [np.nan]}),
+    Case("PicoScope, over range", "infinite.csv", rows("Time,Channel A\n(ms),(V)\n\n", "{k},{T}", 5, "2500,-∞\n"), {"Channel A": [*RISING[:5], np.nan]}, t=[i / 2 for i in range(6)]),
+    Case("Artisan, a roast", "roast.csv", rows("Date:01.03.2026\tUnit:C\tCHARGE:00:01\tTime:10:00\nTime1\tTime2\tET\tBT\tEvent\n", "00:{s}\t\t1{T}\t{T}\t"), {"BT": RISING}),
+    Case("Windows in Chinese", "halves.csv", rows("时间,T\n", "2026/3/1 上午11:59:5{i},{T}", 6, "2026/3/1 下午12:00:00,30\n"), {"T": [*RISING, 30]}, t=[*T6, 10]),
+    Case("a logger that lost power", "power.csv", rows("Time [s],T\n", "{i}.0,{T}.0").encode() + bytes(700) + b"\n6.0,26.0\n7.0,2", {"T": [*RISING, 26]}, t=[*T6, 6]),
+    Case("two files joined, each with a mark of byte order", "joined.csv", 2 * b"\xef\xbb\xbfTime,T\n0,20\n1,21\n2,22\n", {"T": RISING[:3]}, t=T6[:3], how={"run": 2}),
     Case("JSON lines", "run.jsonl", rows("", '{{"time": "' + DATE + 'T10:00:{s}Z", "T": {T}, "P": {P}}}'), {"T": RISING, "P": POWER}),
 )  # fmt: skip
 

@@ -289,6 +289,55 @@ def test_damage_is_said(tmp_path):
         read(tmp_path, table("time,n,T", f"{ISO}0,1,20", "2026-03-01 10:0,2,21", f"{ISO}2,3,22"))
 
 
+@pytest.mark.parametrize("name", ["t", "time"])
+def test_a_last_number_that_was_cut_is_no_number(tmp_path, name):
+    rows = [f"{i},20{i}.50" for i in range(8)]
+    for end in ("20", "208.5", "208."):
+        found = read(tmp_path, table(f"{name},T", *rows) + f"8,{end}")
+        assert len(found) == 8 and any(f"ends in '{end}'" in n for n in found.notes), end
+    assert len(read(tmp_path, table(f"{name},T", *rows) + "8,208.50")) == 9
+    assert len(read(tmp_path, table(f"{name},T", *rows, "8,7") + "9,208")) == 10  # digits as they come
+
+
+def test_hours_or_minutes_is_a_question(tmp_path):
+    short = table("Time,T", *(f"00:{i},{i}" for i in range(50, 60)))
+    for text, how in ((short, {}), (short, {"time": "Time"}), (short.replace("00:", "30:"), {})):
+        with pytest.raises(InputError, match=r":2: .*:50' may be minutes .*--time 'Time \(mm:ss\)'"):
+            read(tmp_path, text, **how)
+    assert read(tmp_path, short, time="Time (mm:ss)").t.tolist() == list(range(50, 60))
+    assert np.diff(read(tmp_path, short, time="Time (hh:mm)").t).tolist() == [60] * 9
+    clear = {
+        "a whole day": table("Time,T", *(f"{i // 6:02d}:{i % 6}0,{i}" for i in range(144))),
+        "by the name": short.replace("Time", "Uhrzeit"),
+        "with a date": table("Date,Time,T", *(f"2026-03-01,00:{i},{i}" for i in range(50, 60))),
+        "in the morning": short.replace("00:", "09:"),
+        "over midnight": table("Time,T", "00:30,1", "12:30,2", "23:59,3", "00:00,4"),
+    }
+    for why, text in clear.items():
+        assert read(tmp_path, text).t[1] in (60, 600, 43200), why
+
+
+def test_units_of_rows_that_are_not_one(tmp_path):
+    rows = [f"{i},{20 + i},{'degC' if i < 2 else 'degF'}" for i in range(4)]
+    with pytest.raises(InputError, match=r":4: .*a value in 'degF' among values in 'degC'"):
+        read(tmp_path, table("time,T,Unit", *rows))
+    with pytest.raises(InputError, match=r":4: column 'Unit': 'glug' after 'V'"):
+        read(tmp_path, table("time,T,Unit", "0,1,V", "1,2,V", "2,3,glug"))
+    found = read(tmp_path, table("time,T,H,TempUnit", "0,20,45,C", "1,21,46,C"))
+    assert not found.units  # the unit is of T, not of its neighbour
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path):
+    for text in (
+        table("time,T", "0,0,20,5", "1,0,21,5", "2,0,22,5"),
+        table("time,T", "1,20,5", "2,21,5", "3,22,5"),
+    ):
+        with pytest.raises(InputError, match=r":1: 2 names, [34] cells .*decimal commas"):
+            read(tmp_path, text)
+    found = read(tmp_path, table("Zeit;P", "0;950", "1;1.000", "2;1.050"))
+    assert found.columns["P"].tolist() == [950, 1000, 1050]
+
+
 def test_two_runs_in_one_file(tmp_path):
     text = table("time,T", "0,20", "1,21", "time,T", "0,30", "1,31", "2,32")
     with pytest.raises(

@@ -113,7 +113,7 @@ def test_excel(tmp_path):
         ("Zeit;x\n01/02/2026 1:00;1\n03/05/2026 1:00;2\n", "cannot be told apart"),
         ("t;x\n", "no rows"),
         ("just a text\nof two lines\n", ":1: 'just a text': no columns"),
-        (b"t;x\n0;1\n1\x00;2\n\xff", "zero bytes"),
+        (b"t;x\n0;\x001\n1\x00;2\n\xff", "zero bytes"),
     ],
 )
 def test_a_mistake_is_one_line_with_its_place(tmp_path, text, says):

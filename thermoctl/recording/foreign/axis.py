@@ -124,6 +124,15 @@ def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Se
     return minutes or clock.from_texts(cells)
 
 
+def chosen(name: str, cells: Cells, unit: str | None) -> Seconds:
+    """Return the column that a person named as seconds; `name` may end in (mm:ss) or (hh:mm).
+
+    Raises ClockError."""
+    if not isinstance(cells, np.ndarray):
+        clock.refuse_minutes(name, cells)
+    return read(name, cells, unit, True)
+
+
 def _exact(cells: pa.Array) -> Seconds:
     """Return long whole numbers, which floats would round, as seconds."""
     compact = clock.tidied(cells)
@@ -261,6 +270,11 @@ def clocks(sheet: Sheet) -> list[tuple[Clock, list[str]]]:
         raise LookupError("; ".join(f"'{'+'.join(c.columns)}' {c.why}" for c in ranked[:4]))
     best = next((c for c in good[1:] if not good[0].columns and _says_it(c, good[0])), good[0])
     sheet.notes += _disagreement(best, good)
+    if len(best.columns) == 1 and not isinstance(texts := sheet.columns[best.columns[0]], np.ndarray):
+        name = best.columns[0]
+        clock.refuse_minutes(
+            f"{name.partition(chr(0))[0]} {sheet.units.get(name, '')}".strip(), _complete(texts)
+        )
     others = _rivals(sheet, best, good[1:])
     best = best if others else _finest(best, good)
     names = list(sheet.columns)

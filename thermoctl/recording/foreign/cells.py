@@ -6,7 +6,7 @@ The whole column decides. A cell that could be two different numbers is an error
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,9 @@ from thermoctl.recording.foreign.units import WORDS, known, scale_between, spell
 
 MISSING = frozenset({"", *(w.strip() for w in WORDS["missing"].split("|"))})
 """Cells that mean "no value", in lower case."""
+_MARKS = r"^(?:[-+*?.=_~–—∞]+|[-+]?\d\.#\w+)$"
+"""Cells of marks only, as loggers write them out of range, and NaN as Windows prints it, such as -1.#J."""
+_NO_READING = 9.9e37  # devices with SCPI send this and larger numbers for "overload" and "no value"
 PAIRS = tuple(tuple(pair.split("/")) for pair in WORDS["pairs"].split())
 """Words of two-valued columns: the first of a pair is 1, the second 0."""
 _GROUP = " '’_\u00a0\u2009\u202f"
@@ -53,13 +56,28 @@ class CellError(Exception):
 
 def is_missing(cell: str) -> bool:
     """Return whether a cell means "no value"."""
-    return cell.strip().lower() in MISSING
+    return cell.strip().lower() in MISSING or re.match(_MARKS, cell.strip()) is not None
 
 
 def is_number(cell: str) -> bool:
     """Return whether a cell can be a number, in any spelling, also with a unit."""
     match = _TIGHT.match(_tidy_one(cell))
     return match is not None and (not match["unit"] or known(match["unit"].strip()))
+
+
+def has_no_readings(columns: Mapping[str, np.ndarray]) -> bool:
+    """Return whether columns hold numbers by which SCPI says that there is no reading."""
+    numbers = (v for v in columns.values() if v.dtype.kind == "f" and len(v))
+    return any(np.fmax.reduce(np.abs(v)) >= _NO_READING for v in numbers)
+
+
+def readings(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Return numbers (N,) without those by which SCPI says that there is no reading; note them."""
+    if not has_no_readings({name: values}):
+        return values
+    none = (np.abs(values) >= _NO_READING) & np.isfinite(values)
+    notes.append(f"'{name}': {int(none.sum())} numbers of 9.9e37 and more read as no value")
+    return np.where(none, np.nan, values)
 
 
 def _tidy_one(cell: str) -> str:
@@ -96,6 +114,7 @@ def words(texts: pa.Array, also_missing: Collection[str] = ()) -> tuple[pa.Array
     spellings = sorted(MISSING | {m.strip().lower() for m in also_missing})
     missing = pc.fill_null(pc.is_in(lower, pa.array(spellings)), True)
     missing = pc.or_(missing, pc.fill_null(pc.equal(tidy, ""), True))
+    missing = pc.or_(missing, pc.fill_null(pc.match_substring_regex(tidy, _MARKS), False))
     shown = pc.unique(pc.drop_null(tidy.filter(missing))).to_pylist()
     return tidy, missing, [w for w in shown if len(w) > len("null") or w in also_missing]
 
@@ -135,7 +154,7 @@ def numbers(
     if not any(pc.any(pc.match_substring_regex(body, p)).as_py() for p in _READINGS.values()):
         return None  # identities such as 345_9356_33_6
     values = _valued(name, parts, empty, decimal)
-    return _with_units(name, values, unit, empty, note)
+    return with_units(name, values, unit, empty, note)
 
 
 def _pair(name: str, tidy: pa.Array, filled: pa.Array) -> Numbers | None:
@@ -215,7 +234,7 @@ def _valued(name: str, parts: pa.Array, empty: np.ndarray, decimal: str | None) 
     return values * signs
 
 
-def _with_units(
+def with_units(
     name: str, values: np.ndarray, unit: pa.Array, empty: np.ndarray, note: tuple[str, ...]
 ) -> Numbers:
     """Bring a column to the unit that its first cell states; cells of other prefixes are converted."""

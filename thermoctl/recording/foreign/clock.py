@@ -37,6 +37,8 @@ _SPELLINGS = tuple(
         (r"^(?:(?i:mon|tue|wed|thu|fri|sat|sun|mo|di|mi|do|fr|sa|so){L}*\.?,?\s+)(\d|{L})", r"\1"),
         (r"^(\d\S*[T ]\d{1,2}:\d{2}(?::[\d.]+)?Z?)(?:/| - )\d.*$", r"\1"),  # from one time to another
         (r"([ap])\.\s?m\.", r"\1m"),
+        (r"(?:上午|午前|오전)\s*(\d[\d:.]*)", r"\1 AM"),
+        (r"(?:下午|午後|오후)\s*(\d[\d:.]*)", r"\1 PM"),
         (r"^(\d{1,2}:\d{2}\S*(?: [AaPp][Mm])?),? (\d{1,4}[-/.](?:\d{1,2}|{L}{3,})[-/.]\d{2,4})$", r"\2 \1"),
         (r"^({L}{3}){L}*\.?\s+(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2}\S*)\s+(\d{4})$", r"\2-\1-\4 \3"),
         (r"^({L}{3}){L}*\.?\s+(\d{1,2}),?\s+(\d{4})", r"\2-\1-\3"),
@@ -64,6 +66,8 @@ _SPELLINGS = tuple(
         (r"(:\d{2}(?:[.,]\d+)?\s?)([+-]\d{2})$", r"\g<1>\2:00"),
     )
 )
+# Names that tell hours from minutes.
+_TOLD = re.compile(r"(?i)m+(?:in\w*)?:s|h+(?:ours?|rs?)?:m|uhr|of.?day|local|utc|gmt")
 _DURATION = r"^(?P<sign>-)?(?P<d>\d+) ?d(?:ays?)?,? *(?P<rest>\d{1,2}:\d{2}.*)$"
 _MAYBE = re.compile(r"\d\D+\d|\d\D*[^\W\d_]{3}|[^\W\d_]{3}\W*\d")
 _ONE_SPELLINGS = tuple((re.compile(p), by) for p, by in _SPELLINGS)
@@ -248,6 +252,25 @@ def from_minutes(texts: pa.Array) -> Seconds | None:
         return None
     t = 60.0 * parts.field("m").cast(pa.float64()).to_numpy() + parts.field("s").cast(pa.float64()).to_numpy()
     return Seconds(t, None, "minutes and seconds, as its name says", "duration")
+
+
+def refuse_minutes(name: str, texts: pa.Array) -> None:
+    """Raise ClockError for times from 00:00 that may be hours and minutes, or minutes and seconds.
+
+    The name, a day's end, or a start later than 00:59 tells."""
+    parts = pc.extract_regex(pc.utf8_trim_whitespace(texts), r"^(?P<h>\d+):(?P<m>\d{2})$")
+    if parts.null_count or len(parts) < 2 or _TOLD.search(name):
+        return
+    hours = _whole(parts.field("h"))
+    t = 60 * hours + _whole(parts.field("m"))
+    steps = np.diff(t)
+    if (hours[0] > 0 and hours.max() <= 24) or steps.min() < -12 * 60 or t[-1] + steps[-1] == 24 * 60:
+        return
+    raise ClockError(
+        0,
+        f"'{texts[0].as_py()}' may be minutes and seconds, or hours and minutes; say --time '{name} (mm:ss)' or "
+        f"--time '{name} (hh:mm)'",
+    )
 
 
 def from_texts(texts: pa.Array) -> Seconds:

@@ -74,25 +74,43 @@ class Dialect:
 def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     """Return a file's text as UTF-8 and a note where its encoding is another. Raises InputError."""
     head = data[:4096]
+    even, odd = head[::2].count(0), head[1::2].count(0)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         encoding = "utf-16"
-    elif head.count(0) > len(head) / 5:  # in UTF-16, every other byte of Latin text is zero
-        encoding = "utf-16-be" if head[:1] == b"\0" else "utf-16-le"
+    elif max(even, odd) > max(len(head) / 5, 4 * min(even, odd)):  # every other byte of Latin text is zero
+        encoding = "utf-16-be" if even > odd else "utf-16-le"
     else:
         try:
             data.decode("utf-8")
-            data = data.removeprefix(b"\xef\xbb\xbf")
-            return data if b"\n" in data else data.replace(b"\r", b"\n"), ()
+            return _whole_lines(data)
         except UnicodeDecodeError:
             encoding = "cp1252"
     try:
-        text = data.decode(encoding)
+        text = data[: len(data) // 2 * 2 if "16" in encoding else None].decode(encoding)
     except UnicodeDecodeError as e:
         raise InputError(
             f"{path}: not text in UTF-8, UTF-16 or Windows-1252 (byte {e.start}); save it as UTF-8"
         ) from None
     name = {"cp1252": "Windows-1252 (Latin-1)"}.get(encoding, "UTF-16")
-    return text.encode("utf-8"), (f"read as {name}",)
+    text_8, notes = _whole_lines(text.encode("utf-8"))
+    return text_8, (f"read as {name}", *notes)
+
+
+def _whole_lines(data: bytes) -> tuple[bytes, tuple[str, ...]]:
+    """Return a text without marks of byte order, its lines with zero bytes empty, and a note on these.
+
+    A loss of power leaves zero bytes where a line was not yet on the disk."""
+    data = data.replace(b"\xef\xbb\xbf", b"")
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    rows = data.split(b"\n") if b"\0" in data else []
+    holed = [k for k, row in enumerate(rows) if b"\0" in row]
+    if not 0 < 2 * len(holed) < len(rows):
+        return data, ()  # whole, or no text at all
+    for k in holed:
+        rows[k] = b""
+    which = ", ".join(str(k + 1) for k in holed[:5])
+    return b"\n".join(rows), (f"zero bytes in line {which}: left out (did the logger lose power?)",)
 
 
 def lines(text: str) -> Iterator[tuple[int, str]]:
@@ -325,6 +343,7 @@ def _header(
         return paired
     lines_of = _header_lines(head, comments, separator, width, data)
     if not lines_of:
+        _refuse_commas(path, head, separator, width, data)
         notes.append("no header: the columns are called column_1, column_2 ...")
         empty = {i for i in range(width) if data and not any(row[i] for row in data)}
         names = [f"\0{i}" if i in empty else f"column_{i + 1}" for i in range(width)]
@@ -355,6 +374,23 @@ def _header(
             take_below(lines_of[-1][1], row, facts)
     units |= aligned(facts, names, units)
     return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
+
+
+_COMMAS = "; if the numbers have decimal commas, separate the cells by semicolons"
+
+
+def _refuse_commas(
+    path: Path, head: list[tuple[int, list[str]]], separator: str, width: int, data: list[list[str]]
+) -> None:
+    """Raise InputError where decimal commas seem to part the numbers: `Time,T` above `0,5,20,5`."""
+    line, names = head[-1] if head else (0, [])
+    whole = all(re.fullmatch(r"[-+]?\d*", c) for row in data for c in row)
+    if separator == "," and whole and 1 < len(names) < width <= 2 * len(names) and all(map(_is_word, names)):
+        raise InputError(f"{path}:{line}: {len(names)} names, {width} cells in the rows below{_COMMAS}")
+
+
+def _is_word(cell: str) -> bool:
+    return _kind(cell) == "w"
 
 
 def _header_lines(
@@ -441,9 +477,13 @@ def _index(path: Path, line: int, width: int, data: list[list[str]], notes: list
 
     Dates, words, and row numbers from 1 (R writes those) are an index."""
     first = [row[0] for row in data]
-    if all(map(is_number, first)) and first != [str(i) for i in range(1, len(first) + 1)]:
+    counted = first == [str(i) for i in range(1, len(first) + 1)] and any(
+        "." in c for row in data for c in row
+    )
+    if all(map(is_number, first)) and not counted:
         raise InputError(
             f"{path}:{line}: {width - 1} names, {width} cells in the rows below; add the name that lacks to the header"
+            f"{_COMMAS}"
         )
     notes.append("the header has one name less than the rows have cells: it lacks the first column's name")
 
@@ -496,10 +536,19 @@ def _decimal(data: list[list[str]], separator: str) -> str | None:
     cells = [x for c in data for x in c if re.search(r"\d", x)]
     commas = [x for x in cells if _COMMA.match(x)]
     if not commas:
-        return None if any("," in x and not is_time(x) for x in cells) else "."
+        thousands = separator == ";" and any(map(_parts_thousands, zip(*data, strict=True)))
+        return None if thousands or any("," in x and not is_time(x) for x in cells) else "."
     if any(re.match(r"[-+]?\d*\.\d", x) for x in cells):
         return None
     return "," if separator == ";" or any(not _AMBIGUOUS.match(x) for x in commas) else None
+
+
+def _parts_thousands(column: tuple[str, ...]) -> bool:
+    """Return whether the points of a column part thousands: `950` before `1.050`, no other digits."""
+    parted = [c for c in column if re.fullmatch(r"[-+]?[1-9]\d{0,2}(\.\d{3})+", c)]
+    whole = [c for c in column if re.fullmatch(r"[-+]?\d{1,3}", c)]
+    others = [c for c in column if not is_missing(c) and c not in parted and c not in whole]
+    return bool(parted and whole) and not others and any(c.endswith("0") for c in parted)
 
 
 def _numeric(names: tuple[str, ...], data: list[list[str]]) -> frozenset[str]:

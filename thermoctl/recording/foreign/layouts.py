@@ -19,7 +19,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
 from thermoctl.recording.foreign.sheet import Sheet, place_in
-from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled
+from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled, states_unit_of
 
 IDS = WORDS["identities"].split()
 VALUES = WORDS["values"].split()
@@ -345,6 +345,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
         return None
     if len(times) == 1:
         times = {n: _of_one_day(c, sheet.notes) for n, c in times.items()}
+    units = {n: c for n, c in rest.items() if states_unit_of(n, "") and not isinstance(c, np.ndarray)}
     if tags and identity.startswith("_"):
         ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
     sheets = []
@@ -353,16 +354,8 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
             continue
         rows = np.flatnonzero(pc.equal(ids, name).to_numpy(zero_copy_only=False))
         place = _places(sheet.place, rows)
-        columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value]}.items()}
-        sheets.append(
-            Sheet(
-                columns,
-                place,
-                {name: u} if (u := _unit(rest, rows)) else {},
-                name=name,
-                decimal=sheet.decimal,
-            )
-        )
+        columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value], **units}.items()}
+        sheets.append(Sheet(columns, place, name=name, decimal=sheet.decimal))
     if sheets:
         sheets[0].notes += sheet.notes
     return sheets or None
@@ -428,15 +421,6 @@ def _places(place: Callable[[int], str], rows: np.ndarray) -> Callable[[int], st
 
 def _taken(cells: Any, rows: np.ndarray) -> Any:
     return cells[rows] if isinstance(cells, np.ndarray) else cells.take(pa.array(rows))
-
-
-def _unit(rest: Mapping[str, Any], rows: np.ndarray) -> str | None:
-    for name, cells in rest.items():
-        if name.lower() in ("unit", "unit_of_measurement", "einheit", "units") and not isinstance(
-            cells, np.ndarray
-        ):
-            return spelled(cells[int(rows[0])].as_py())
-    return None
 
 
 def _is_clock(cells: Any) -> bool:

@@ -25,6 +25,7 @@ import pyarrow.parquet
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
+from thermoctl.recording.foreign.cells import has_no_readings
 from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
@@ -45,7 +46,7 @@ def read_recording(
         if _is_ours(path, said):
             try:
                 table = files.read_table(path)
-                if not any(split_unit(n)[1] for n in table.columns):
+                if not any(split_unit(n)[1] for n in table.columns) and not has_no_readings(table.columns):
                     said.trace.extend(
                         ("format: " + kind_of(path), "time: 't': a table of numbers with a time in seconds")
                     )
@@ -115,12 +116,15 @@ def _plain(path: Path) -> bool:
     """Return whether a text has commas, points, t or t_s as its only time, and no units in the header."""
     with open(path, "rb") as f:
         head = f.read(HEAD)
+        ends = f.seek(max(f.seek(0, 2) - 1, 0)) == 0 or f.read(1) in b"\r\n"
     try:
         text = head.removeprefix(b"\xef\xbb\xbf").decode(
             "utf-8", errors="strict" if len(head) < HEAD else "ignore"
         )
     except UnicodeDecodeError:
         return False
+    if not ends:
+        return False  # the last line may be cut off
     shown = [line for _, line in zip(range(2), (x for _, x in lines(text)), strict=False)]
     if not shown:
         return True  # empty: read_table refuses it

@@ -46,6 +46,11 @@ MAGIC = (
     (b"\x1f\x8b", "gzip"),
 )
 _QUOTED = re.compile(rb'^"([^"\n]*[,;\t][^"\n]*[,;\t][^"\n]*)"\r?$', re.MULTILINE)  # a row that is one cell
+# The header of a segment of LVM, with the line of names below it.
+_SEGMENT = re.compile(rb"(?ms)^Channels\t.*?^\*{3}End_of_Header\*{3}[^\n]*\n[^\n]*\n")
+_ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and seconds
+SHOWN = 8192  # number of last bytes that show the digits of the last column
+FEW = 6  # least number of lines that show them
 _SUFFIXES = {
     ".mf4": "mdf",
     ".mdf": "mdf",
@@ -155,6 +160,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
+    text = _one_header(text, notes)
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
         notes.append("whole lines stand in quotes; read without them")
@@ -164,6 +170,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
     if len(dialect.names) == 1:
         text = _with_empty_lines(text, dialect, notes)
+    text = _without_cut(text, dialect, notes)
     how.trace.append(f"read as: text, separator {shown(dialect.separator)}, data from line {dialect.first}")
     notes += dialect.notes
 
@@ -177,6 +184,38 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     stated = _stated(sheet, dialect)
     stated[0].again = closely  # reading cell by cell gives an error with the line
     return stated
+
+
+def _one_header(text: bytes, notes: list[str]) -> bytes:
+    """Return an LVM text of several segments with the first header alone, without its interval."""
+    if not text.startswith(b"LabVIEW") or len(found := _SEGMENT.findall(text)) < 2:
+        return text
+    notes.append(f"{len(found)} segments, each with a header: read as one table")
+    head, body = text.split(found[0], 1)
+    body = _SEGMENT.sub(lambda m: b"\n" * m[0].count(b"\n"), body)
+    return head + re.sub(rb"(?m)^(?:X0|Delta_X)\t.*$", b"", found[0]) + body
+
+
+def _without_cut(text: bytes, dialect: Dialect, notes: list[str]) -> bytes:
+    """Return the text without a last line that has no end and fewer last digits than all others.
+
+    A logger that lost power wrote `206.5` as `20`."""
+    if text.endswith(b"\n"):
+        return text
+    shown = _body(text, dialect)[-SHOWN:].decode("utf-8", errors="ignore").splitlines()[1:]
+    last = [cells_of(line, dialect.separator)[-1] for line in shown if line.strip()]
+    digits = [len(re.sub(r"^[^.,]*[.,]?", "", c)) for c in last]
+    if (
+        len(set(digits[:-1])) != 1
+        or len(last) < FEW
+        or not digits[-1] < digits[0]
+        or cells.is_missing(last[-1])
+    ):
+        return text
+    notes.append(
+        f"the last line ends in '{last[-1]}', without the digits of the others: left out (was the file cut off?)"
+    )
+    return text[: text.rfind(b"\n") + 1]
 
 
 def _innermost(text: bytes) -> tuple[bytes, int]:
@@ -206,6 +245,8 @@ def _with_empty_lines(text: bytes, dialect: Dialect, notes: list[str]) -> bytes:
 def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:
     """Return a sheet with the units and the interval of its dialect; of a long table one a signal."""
     sheet.units = dict(dialect.units)
+    if set(dialect.names) >= _ARTISAN:
+        sheet.units["Time1"] = "mm:ss"
     sheet.columns = {n: c for n, c in sheet.columns.items() if not FACT.match(n)}
     sheet.decimal = dialect.decimal or ("," if dialect.separator == ";" else None)
     if (stated := stated_step(dialect.facts)) is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from thermoctl.recording.foreign.axis import Clock
 from thermoctl.recording.foreign.cells import CellError
 from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.sheet import How, Sheet
-from thermoctl.recording.foreign.units import column_of, interval, named, tokens
+from thermoctl.recording.foreign.units import column_of, interval, known, named, states_unit_of, tokens
 from thermoctl.recording.table import Table
 
 _ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
@@ -68,34 +69,63 @@ def _valued(path: Path, sheet: Sheet, how: How) -> Sheet:
     texts = {n: c for n, c in sheet.columns.items() if not isinstance(c, np.ndarray)}
     decimal = how.decimal or _decimal(texts.values(), sheet)
     valued = replace(sheet, columns={}, units=dict(sheet.units), notes=list(sheet.notes))
-    left = []
     for name, column in sheet.columns.items():
         if isinstance(column, np.ndarray):
-            valued.columns[name] = _without(column, how.missing)
+            _put(valued, name, cells.Numbers(_without(column, how.missing)))
             continue
         try:
             values = _of_texts(name.partition("\0")[0], column, decimal, how.missing, valued.notes)
         except CellError as e:
             raise CellError(e.row, f"column '{name.partition(chr(0))[0]}': {e.reason}") from None
         if isinstance(values, cells.Numbers):
-            valued.columns[name] = _without(values.values, how.missing)
-            valued.notes += values.notes
-            stated = valued.units.get(name)
-            if values.unit and stated and stated != values.unit:
-                raise CellError(
-                    0,
-                    f"column '{name}': its header says {stated}, its cells {values.unit}; one unit was expected",
-                )
-            if values.unit:
-                valued.units[name] = values.unit
+            _put(valued, name, replace(values, values=_without(values.values, how.missing)))
         elif values is not None:
             valued.columns[name] = values
         else:
             valued.left[name] = next((w for w in column.to_pylist() if w and w.strip()), "")
-            left.append(name.partition("\0")[0].strip() or f"column {list(sheet.columns).index(name) + 1}")
+    _take_units(sheet, valued)
+    left = [_plain(n) or f"column {list(sheet.columns).index(n) + 1}" for n in valued.left]
     if left:
         valued.notes.append(f"columns of text left out: {', '.join(left)}")
     return valued
+
+
+def _put(valued: Sheet, name: str, found: cells.Numbers) -> None:
+    """Put a column of numbers into the sheet. Raises CellError for a unit unlike its header's."""
+    stated = valued.units.get(name)
+    if found.unit and stated and stated != found.unit:
+        raise CellError(
+            0, f"column '{name}': its header says {stated}, its cells {found.unit}; one unit was expected"
+        )
+    valued.notes += found.notes
+    valued.columns[name] = cells.readings(_plain(name), found.values, valued.notes)
+    if found.unit:
+        valued.units[name] = found.unit
+
+
+def _take_units(sheet: Sheet, valued: Sheet) -> None:
+    """Bring each column that a column of units follows to the unit of its first row. Raises CellError.
+
+    A multimeter that changes its range writes `999.8, mV` and `1.0002, V`."""
+    for before, name in pairwise(sheet.columns):
+        values = valued.columns.get(before)
+        if name not in valued.left or not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+            continue
+        if not states_unit_of(_plain(name), _plain(before)):
+            continue
+        texts = pc.utf8_trim_whitespace(pc.fill_null(sheet.columns[name], ""))
+        texts = pc.replace_substring_regex(texts, r"\s*(?:AC|DC)\s*", "")
+        words = [w for w in pc.unique(texts).to_pylist() if w]
+        if all(map(known, words)):
+            del valued.left[name]
+            _put(valued, before, cells.with_units(_plain(before), values, texts, ~np.isfinite(values), ()))
+        elif len(words) > 1:
+            row = pc.index(texts, words[1]).as_py()
+            raise CellError(
+                row,
+                f"column '{_plain(name)}': '{words[1]}' after '{words[0]}': one unit was expected, or units that are known "
+                f"(convert '{_plain(before)}' to one)",
+            )
 
 
 def _without(values: np.ndarray, missing: Sequence[str]) -> np.ndarray:
@@ -258,7 +288,10 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
     if how.time is None and sheet.clock is not None:
         return [(Clock(("time of the channel",), sheet.clock, 0, ""), names)]
     if how.time is not None:
-        chosen = column_of(how.time, sheet.columns, sheet.units)
+        base = re.sub(r"(?i)\s*[\[(](?:mm:ss|hh:mm)[\])]$", "", how.time)
+        chosen = column_of(how.time, sheet.columns, sheet.units) or column_of(
+            base, sheet.columns, sheet.units
+        )
         if chosen is None and (step := interval(how.time)):
             t = step * np.arange(len(sheet))
             note = f"{step:g} s from row to row, as --time says"
@@ -269,7 +302,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
                 f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}; {_ADVICE}"
             )
         try:
-            seconds = axis.read(chosen, sheet.columns[chosen], sheet.units.get(chosen), True)
+            seconds = axis.chosen(how.time, sheet.columns[chosen], sheet.units.get(chosen))
         except ClockError as e:
             raise InputError(f"{sheet.place(e.row)}: column '{chosen}': {e.reason}") from None
         return [(Clock((chosen,), seconds, 0, ""), [n for n in names if n != chosen])]

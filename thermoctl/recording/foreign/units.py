@@ -137,6 +137,7 @@ NAMED, COUNTED = 30, -30  # points for a name of times, for a name of a counter
 _TIMES = WORDS["times"].split()
 _COUNTERS = WORDS["counters"].split()
 _OTHERS = WORDS["other_times"].split()
+_UNIT_NAMES = {*WORDS["units"].split()}
 MOST_WORDS = 3  # largest number of words in a counter's name
 _STEPS = ("step", "index", "number", "no", "nr", "count", "id", "idx")
 NO_NAME = re.compile(r"column_\d+$")  # column of a table without a header
@@ -168,6 +169,13 @@ def named(name: str) -> int:
     if "#" in name or any(w in _COUNTERS for w in words[:1]):
         return COUNTED
     return 0
+
+
+def states_unit_of(name: str, before: str) -> bool:
+    """Return whether a column of texts is named as the unit of the one before it: Unit, `Main Unit`."""
+    words = set(tokens(name.replace("_of_measurement", "")))
+    others = words - _UNIT_NAMES
+    return named(before) <= 0 and others < words and others <= set(tokens(before))
 
 
 def is_generic(name: str) -> bool:
