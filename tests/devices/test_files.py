@@ -225,6 +225,20 @@ def test_a_page_that_the_file_does_not_describe_gives_the_signals_of_every_page(
     )
 
 
+def test_a_page_without_signals_below_costs_no_signal_beside_it(tmp_path):
+    """Extended multiplexing: of page 7 Volts counts, and of Sub, which is on it too, no page but 3 is described."""
+    dbc = (
+        'BO_ 801 READING: 8 DEV\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" H\n SG_ Sub m7M : 8|8@1+ (1,0) [0|0] "" H\n'
+        ' SG_ Volts m2 : 16|16@1- (0.01,0) [0|0] "V" H\n SG_ T m3 : 32|8@1+ (1,-40) [0|0] "°C" H\n\n'
+        "SG_MUL_VAL_ 801 Sub Page 7-7, 9-12;\nSG_MUL_VAL_ 801 Volts Page 2-2, 7-7;\nSG_MUL_VAL_ 801 T Sub 3-3;\n"
+    )
+    dev = device(tmp_path, START + dbc, [V, T])
+    sample = read(dev, (801, bytes.fromhex("0700d2043c000000")))
+    assert sample.value[ROLE["voltage_v"]] == pytest.approx(12.34) and sample.status[ROLE["air_c"]] != OK
+    sample = read(dev, (801, bytes.fromhex("0c0300003c000000")))
+    assert sample.value[ROLE["air_c"]] == pytest.approx(20) and sample.status[ROLE["voltage_v"]] != OK
+
+
 J1939 = 'BO_ 2566844158 ET1: 8 DEV\n SG_ T : 0|8@1+ (1,-40) [0|0] "deg C" HOST\n'
 ET1 = "t: {message: ET1, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1, sentinels: [215]"
 

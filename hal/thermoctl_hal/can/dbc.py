@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
@@ -124,9 +125,10 @@ class DbcDevice(Device):
                 )
             return
         try:
-            values = _decoded(entry[0], data, True)
+            needed = (*(s.signal for _, s in entry[1]), *entry[2])
+            values = _decoded(entry[0], data, True, needed)
             readings = [(i, s, float(values[s.signal])) for i, s in entry[1] if s.signal in values]
-            raws = _decoded(entry[0], data, False) if entry[2] else {}
+            raws = _decoded(entry[0], data, False, needed) if entry[2] else {}
         except Exception as e:  # foreign bytes may raise anything in the library
             self.counts["errors"] += 1
             self._quiet += 1
@@ -176,21 +178,32 @@ class DbcDevice(Device):
         return self.counts
 
 
-def _decoded(message: DbcMessage, data: bytes, scaling: bool) -> Mapping[str, Any]:
-    """Return the signals of a frame; of a page that the file does not describe, those of every page."""
+def _decoded(
+    message: DbcMessage, data: bytes, scaling: bool, wanted: Iterable[str] = ()
+) -> Mapping[str, Any]:
+    """Return the signals of a frame.
+
+    Of a page that the file does not describe, those of every page and the wanted ones."""
     try:
         found: Any = message.decode_simple(data, False, scaling, True)
     except Exception:  # foreign bytes may raise anything in the library
         if not message.is_multiplexed():
             raise
-        found = _every_page(message).decode_simple(data, False, scaling, True)
+        found = _alone(message, "").decode_simple(data, False, scaling, True)
+        for name in wanted:
+            with suppress(Exception):  # it is on another page
+                found |= _alone(message, name).decode_simple(data, False, scaling, True)
     return cast(Mapping[str, Any], found)
 
 
-@lru_cache(maxsize=64)
-def _every_page(message: DbcMessage) -> DbcMessage:
-    """Return a multiplexed message without the signals of single pages."""
-    signals = [s for s in message.signals if not s.multiplexer_ids]
+@lru_cache(maxsize=256)
+def _alone(message: DbcMessage, name: str) -> DbcMessage:
+    """Return a multiplexed message with the signals of every page, and one with its multiplexers."""
+    by_name, chain = {s.name: s for s in message.signals}, set()
+    while name in by_name:
+        chain.add(name)
+        name = by_name[name].multiplexer_signal or ""
+    signals = [s for s in message.signals if not s.multiplexer_ids or s.name in chain]
     return type(message)(message.frame_id, message.name, message.length, signals, strict=False)
 
 
