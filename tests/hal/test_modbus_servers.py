@@ -343,6 +343,22 @@ def line():
         links.leave(link)
 
 
+@pytest.mark.parametrize("late_s", [0.22, 0.3, 0.38])
+def test_a_unit_that_is_always_late_gives_no_register_for_another(line, late_s):
+    """An RTU answer names no register: that to the request before would be the answer to the next one."""
+
+    def late(request, answer):
+        time.sleep(late_s)  # the unit's own slowness, longer than the time-out
+        return answer
+
+    link, found = line(late), []
+    for register in (0, 8, 100, 0, 8, 100):
+        with contextlib.suppress(links.NoAnswer):
+            found.append((register, link.read("holding", register, 1, 1, 0.2)))
+    assert [f for f in found if f[1] != [REGISTERS[f[0]]]] == []
+    assert link.read("holding", 8, 1, 1, 1.0) == [888]  # with a time-out that is long enough
+
+
 @pytest.mark.parametrize("zeros", [b"", b"\0", b"\0\0\0", b"\xff\0"])
 @pytest.mark.parametrize("echo", [False, True])
 def test_an_echo_and_zeros_before_an_rtu_answer_are_passed_over(line, zeros, echo):

@@ -9,9 +9,10 @@ Ports: "tcp:host:port" (Modbus TCP), "rtu:/dev/serial/by-id/..." (a serial line)
 Messages and frames are pymodbus'; no other module uses it. Its client gives up on bytes that real devices
 send beside an answer, so connections are ours.
 
-Bytes that arrived before a request, such as a late answer, are dropped. A server that closes the connection
-after an answer is connected again for the next request. One that is silent after connecting gets more
-time at each connection before it is asked. On a serial line the echo of the request and bytes before the
+Bytes that arrived before a request, such as a late answer, are dropped. An answer on a serial line does not
+name its register. So a late one is waited for before another register of the unit is asked. A server that
+closes the connection after an answer is connected again for the next request. One that is silent after
+connecting gets more time at each connection. On a serial line the echo of the request and bytes before the
 answer are passed over.
 """
 
@@ -44,6 +45,7 @@ HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the lo
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
 GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
+QUIET_S = 0.05  # silence behind a frame, longer than an adapter holds bytes back
 CHUNK = 4096
 ATTEMPTS = 3  # largest number of times that a request is sent, if the server closes the connection
 _HOST = r"(\[[^]]+\]|[^:/]+):(\d+)/?"
@@ -83,6 +85,7 @@ class Link:
         self._echoes = False  # does the line send our own bytes back?
         self._answered = False
         self._free_s = 0.0  # time from which the next RTU frame may begin
+        self._lost: _Request | None = None  # the last request, if it was not answered in time
         self._is_rtu = port.startswith("rtu:")
         messages, framers = (load(f"pymodbus.{name}", port) for name in ("pdu", "framer"))
         self._invalid = load("pymodbus", port).ModbusException
@@ -191,9 +194,12 @@ class Link:
 
     def _ask_once(self, message: Any, timeout_s: float) -> bytes:
         """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
+        request = self._framed(message)
+        if self._is_rtu and self._lost is not None and _may_answer(self._lost, request):
+            self._drop_late(timeout_s)
+        self._lost = request
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self._drop()
-        request = self._framed(message)
         end = time.monotonic() + timeout_s
         self._send(request.frame, end)
         received = b""
@@ -203,6 +209,7 @@ class Link:
             received += self._take()
             answer = self._found_rtu(received, request) if self._is_rtu else _found_tcp(received, request)
             if answer is not None:
+                self._lost = None
                 self._rest()
                 return answer
         self._rest()
@@ -222,6 +229,13 @@ class Link:
         """Drop the bytes that came before this request. Raises _Closed, OSError."""
         while select.select([self._line], [], [], 0.0)[0]:
             self._take()
+
+    def _drop_late(self, timeout_s: float) -> None:
+        """Drop the late answer to another request. Raises _Closed, OSError."""
+        end, left = time.monotonic() + timeout_s, timeout_s
+        while left > 0.0 and select.select([self._line], [], [], left)[0]:
+            self._take()
+            left = min(QUIET_S, end - time.monotonic())
 
     def _take(self) -> bytes:
         try:
@@ -306,6 +320,11 @@ def _rtu_size(data: bytes, request: _Request) -> int:
     if data[1] != request.function:
         return 0
     return 8 if request.function in (WRITE_COIL, 6, WRITE_SEVERAL) else 5 + data[2]
+
+
+def _may_answer(lost: _Request, request: _Request) -> bool:
+    """Return whether the answer to a request looks as one to another: RTU repeats no register."""
+    return (lost.unit, lost.function) == (request.unit, request.function) and lost.pdu != request.pdu
 
 
 def _has_good_crc(frame: bytes) -> bool:
