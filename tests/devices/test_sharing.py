@@ -1,5 +1,7 @@
 """Devices that share a wire: opened once, asked in turn; one that fails leaves the others alone."""
 
+import contextlib
+import os
 import struct
 import threading
 import time
@@ -152,6 +154,49 @@ def test_text_devices_that_are_asked_share_a_line(tmp_path):
         wire.plug()
         values.update({1: 17, 2: 18})
         rig.until(lambda: shown() == values)
+    wire.close()
+
+
+def test_a_late_answer_is_not_taken_for_another_device(tmp_path):
+    """A gauge that is always later than `answer_s` gives no reading, and its neighbours keep theirs."""
+    takes_s, wrong = {1: 0.3, 2: 0.15}, []  # answer_s is 0.2 s
+
+    def send(answer):
+        with contextlib.suppress(IndexError, OSError):  # the wire is closed
+            os.write(wire.fds[0], answer)
+
+    def take(data):
+        out = b""
+        for request in data.split(b"\r")[:-1]:
+            number = int(request[1:])
+            answer = b"%+08.1f\r" % (100.0 * number)
+            if number in takes_s:
+                threading.Timer(takes_s[number], send, [answer]).start()
+            else:
+                out += answer
+        return out
+
+    wire = Port(take, tmp_path / "line")
+    roles = {1: "position_um", 2: "output_reference_um", 3: "voltage_v"}
+    text = "\n".join(
+        f"- {{name: g{k}, profile: gauge{k}.yaml, port: {tmp_path}/line, address: {k}, roles: {{x: {role}}}}}"
+        for k, role in roles.items()
+    )
+    for k in roles:
+        gauge = GAUGE.replace("um", "V") if k == 3 else GAUGE
+        (tmp_path / f"gauge{k}.yaml").write_text(
+            gauge.replace("request_hz: 200, answer_s: 0.02", "request_hz: 5, answer_s: 0.2")
+        )
+
+    with Rig(tmp_path, text) as rig:
+
+        def asked_often():
+            read = {k: rig.value(role) for k, role in roles.items() if rig.status(role) == "OK"}
+            wrong.extend((k, v) for k, v in read.items() if v != 100.0 * k)
+            return rig.backend.counters()["g3.frames"] > 8
+
+        rig.until(asked_often)
+    assert not wrong
     wire.close()
 
 

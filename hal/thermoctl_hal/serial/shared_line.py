@@ -2,6 +2,7 @@
 
 The turn goes to the device whose request is overdue for longest. It ends with the device's answer, or after
 its `answer_s`. Bytes that arrive during the turn belong to that device; bytes between turns are dropped.
+After a turn without an answer, the late one is waited for as long again: it may not say whose it is.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Protocol
 from thermoctl_hal.base.line import open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import read_available
+
+QUIET_S = 0.05  # silence behind a late answer, longer than an adapter holds bytes back
 
 
 class Asked(Protocol):
@@ -44,6 +47,7 @@ class SharedLine:
         self._data: dict[int, bytes] = {}
         self._turn: Asked | None = None
         self._until_s, self._answers = 0.0, 0
+        self._free_s = 0.0  # time of the next turn
 
     def serve(self, now_s: float) -> None:
         """Take what has arrived, end a turn, begin the next one. Raises OSError when the line is gone."""
@@ -52,9 +56,14 @@ class SharedLine:
             if turn is not None:
                 if data:
                     self._data[id(turn)] = self._data.get(id(turn), b"") + data
-                if turn in self.users and turn.answers() == self._answers and now_s < self._until_s:
+                silent = turn in self.users and turn.answers() == self._answers
+                if silent and now_s < self._until_s:
                     return
-                self._turn = None
+                self._turn, self._free_s = None, now_s + (turn.answer_s if silent else 0.0)
+            elif data:
+                self._free_s = min(self._free_s, now_s + QUIET_S)
+            if now_s < self._free_s:
+                return
             due = [u for u in self.users if u.request_due_s(now_s) <= now_s]
             if due:
                 turn = self._turn = min(due, key=lambda u: u.request_due_s(now_s))
