@@ -132,6 +132,22 @@ def test_the_other_decimal_sign_and_blanks_are_read_where_the_profile_says_so(ga
     assert comma.says("+1,2,3") is None and "is no decimal" in comma.device.silence()
 
 
+def test_a_half_answer_is_no_part_of_the_next_one(gauge):
+    """`2` of an answer that was cut, and `21.5` of the next one, gave 221.5."""
+    made = gauge("(?P<x>[0-9.]+)$", ", request: 'T?', request_hz: 20")
+    os.write(made.master, b"2")
+    end = time.monotonic() + 10.0
+    while made.device._lines.pending == 0 and time.monotonic() < end:
+        made.device.read(made.sample, 1.0)
+    made.device._lines._heard_s -= 1.0  # and the rest does not come
+    made.device.read(made.sample, 2.0)  # asks again
+    assert made.device._lines.pending == 0
+    os.write(made.master, b"21.5\r\n")
+    while not made.sample.fresh[POSITION] and time.monotonic() < end:
+        made.device.read(made.sample, 2.0)
+    assert made.sample.value[POSITION] == 21.5
+
+
 def test_bytes_without_a_line_end_are_told(gauge):
     g = gauge("(?P<x>[-+.0-9]+)$")
     assert "nothing arrives" in g.device.silence()

@@ -12,6 +12,7 @@ import os
 import re
 import socket
 import termios
+import time
 
 import serial
 
@@ -21,6 +22,7 @@ from thermoctl_hal.base.profile import LineSettings
 
 NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter
+QUIET_S = 0.05  # longest pause within a line: an adapter holds bytes back
 MAX_LINE = 1024  # a text line longer than this is garbage
 _CHARACTERS = 6  # index of the special characters in termios' list
 
@@ -34,10 +36,12 @@ class LineReader:
         self._end = end
         self._buffer = bytearray()
         self._dropping = False
+        self._heard_s = 0.0  # time of the newest bytes
         self.bad = 0
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that `data` completes, in order, without their ends."""
+        self._heard_s = time.monotonic()
         self._buffer += data
         text = bytes(self._buffer)
         *lines, rest = text.split(self._end) if self._end else text.replace(b"\r", b"\n").split(b"\n")
@@ -53,6 +57,11 @@ class LineReader:
     def pending(self) -> int:
         """Count the bytes of a line that has no end yet."""
         return MAX_LINE if self._dropping else len(self._buffer)
+
+    def drop_half(self, period_s: float) -> None:
+        """Drop an incomplete line if its rest is lost: nothing came for most of `period_s`."""
+        if time.monotonic() - self._heard_s > min(QUIET_S, 0.7 * period_s):
+            self.reset()
 
     def reset(self) -> None:
         """Drop an incomplete line."""

@@ -121,6 +121,8 @@ class SerialDevice(Device):
         """Send the request. A half answer to the one before is dropped."""
         if self._framer is not None:
             self._framer.drop()
+        else:
+            self._lines.drop_half(1.0 / self._request_hz)
         with contextlib.suppress(BlockingIOError):  # the line is full: ask again at the next due time
             os.write(fd, self._request)
 

@@ -11,11 +11,9 @@ import contextlib
 import threading
 from typing import Protocol
 
-from thermoctl_hal.base.line import open_port
+from thermoctl_hal.base.line import QUIET_S, open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import read_available
-
-QUIET_S = 0.05  # silence behind a late answer, longer than an adapter holds bytes back
 
 
 class Asked(Protocol):
