@@ -299,6 +299,30 @@ def test_a_last_number_that_was_cut_is_no_number(tmp_path, name):
     assert len(read(tmp_path, table(f"{name},T", *rows, "8,7") + "9,208")) == 10  # digits as they come
 
 
+def test_a_cut_line_of_json_and_a_broken_first_row_are_said(tmp_path):
+    rows = ['{"t": 0, "T": 20}', '{"t": 1, "T": 21}', '{"t": 2, "T"']
+    found = read(tmp_path, "\n".join(rows))
+    assert found.t.tolist() == [0, 1] and any("line 3 at the end left out" in n for n in found.notes)
+    with pytest.raises(InputError, match=r"run\.csv:2: no JSON"):
+        read(tmp_path, "\n".join([rows[0], rows[2], rows[1]]))
+    with pytest.raises(InputError, match=r"run\.csv:2: 2 cells; 3 as in the rows below"):
+        read(tmp_path, "Time      T     P\n   0  20.0-100.0\n   1  21.0   0.0\n   2  22.0   0.0\n")
+
+
+def test_a_hidden_sheet_is_the_last_one_and_formulas_without_results_are_said(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    old, new = book.active, book.create_sheet("new")
+    old.sheet_state, book.active = "hidden", 1
+    for k in range(3):
+        old.append(["t", "T", "P"] if not k else [k, 99, 99])
+        new.append(["t", "T", "P"] if not k else [k, 20 + k, f"=2*{k}"])
+    book.save(tmp_path / "run.xlsx")
+    found = read_recording(tmp_path / "run.xlsx")
+    assert found.columns["T"].tolist() == [21, 22]
+    assert any("no value at all: P (formulas without results?" in n for n in found.notes)
+
+
 def test_hours_or_minutes_is_a_question(tmp_path):
     short = table("Time,T", *(f"00:{i},{i}" for i in range(50, 60)))
     for text, how in ((short, {}), (short, {"time": "Time"}), (short.replace("00:", "30:"), {})):

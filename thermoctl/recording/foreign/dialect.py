@@ -356,6 +356,8 @@ def _header(
     while len(lines_of) > 1 and below and sum(bool(c) for c in lines_of[-1][1]) < width / 2:
         lines_of.pop()
     line, cells = lines_of[-1]
+    if len(cells) < width and any(map(is_number, cells)) and all(map(_is_word, lines_of[0][1])):
+        raise InputError(f"{path}:{line}: {len(cells)} cells; {width} as in the rows below were expected")
     cells = _widened(cells, width, data)
     if cells[1:] == lines_of[-1][1]:
         _index(path, line, width, data, notes)

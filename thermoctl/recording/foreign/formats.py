@@ -175,14 +175,16 @@ def _chosen(path: Path, name: str, names: list[str], what: str) -> str:
 
 
 def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
-    """Return the sheets of an Excel file, or the named one, as comma-separated text. Raises InputError."""
+    """Return the sheets of an Excel file, hidden ones last, or the named one, as comma-separated text.
+
+    Raises InputError."""
     openpyxl = load("openpyxl", path)
     path.stat()
     sheets = []
     try:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         titles = [w.title for w in book.worksheets]
-        for page in book.worksheets:
+        for page in sorted(book.worksheets, key=lambda w: w.sheet_state != "visible"):
             out = io.StringIO()
             writer = csv.writer(out, lineterminator="\n")
             for row in page.iter_rows(values_only=True) if sheet in (None, page.title) else ():

@@ -79,21 +79,38 @@ def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _json(path: Path, text: str) -> list[Sheet] | None:
+    notes: list[str] = []
     try:
         content = json.loads(text)
     except ValueError as e:
-        try:
-            content = [json.loads(line) for line in text.splitlines() if line.strip()]
-        except ValueError:
+        content = _json_lines(path, text, notes)
+        if not content:
             if path.suffix.lower() == ".json":
                 raise InputError(f"{path}: no JSON: {e}") from None
             return None
     if sheets := _of_json(path, content):
+        sheets[0].notes += notes
         return sheets
     raise InputError(
         f'{path}: no table in this JSON; records [{{"t": 0, "T": 20}}, ...], columns {{"t": [0, 1], "T": [20, 21]}} '
         'or rows [["t", "T"], [0, 20], ...] were expected'
     )
+
+
+def _json_lines(path: Path, text: str, notes: list[str]) -> list[Any]:
+    """Return the values of lines of JSON; none where the first line is none. A cut last line is a note."""
+    rows = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
+    found: list[Any] = []
+    for number, line in rows:
+        try:
+            found.append(json.loads(line))
+        except ValueError as e:
+            if not found:
+                break
+            if number != rows[-1][0]:
+                raise InputError(f"{path}:{number}: no JSON: {e}; a line of JSON was expected") from None
+            notes.append(f"line {number} at the end left out: no whole JSON (was the file cut off?)")
+    return found
 
 
 def _of_json(path: Path, content: Any) -> list[Sheet] | None:

@@ -56,6 +56,9 @@ def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str])
         raise InputError(f"{path}: no column of numbers beside the time; columns of text: {text or 'none'}")
     if not len(table):
         raise InputError(f"{path}: no rows; at least one sample was expected")
+    if empty := [n for n, v in table.columns.items() if not np.isfinite(v).any()]:
+        formulas = " (formulas without results? save the file in Excel)" if path.suffix[:4] == ".xls" else ""
+        later.append(f"no value at all: {', '.join(empty)}{formulas}")
     earliest: dict[str, str] = {}  # the earliest of notes that differ only in a clock's start
     for note in (n for p in parts for n in p.notes):
         earliest[_SINCE.sub("", note)] = min(note, earliest.get(_SINCE.sub("", note), note))
