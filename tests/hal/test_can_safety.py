@@ -216,6 +216,21 @@ def test_a_foreign_producer_that_comes_later_stops_the_axis(bus):
     until(lambda s: s.status[STATE] == ERROR and drive.command == 0, m)
 
 
+@pytest.mark.parametrize("rpdo", [1, 3])
+def test_another_master_that_sends_the_command_stops_the_axis(bus, rpdo):
+    drive, other, m = bus.drive(5), bus.member(), bus.master(5)
+    m.backend.open()
+    m.drive, m.enable = 0.25, True
+    until(lambda s: drive.command == 250_000, m)
+    command = can.Message(arbitration_id=0x105 + 0x100 * rpdo, data=bytes(6), is_extended_id=False)
+    other.send(command)
+    until(lambda s: s.status[STATE] == ERROR and drive.command == 0, m)
+    assert "two masters would drive one axis" in m.backend.problem("amplifier_state")
+    until(lambda s: s.status[STATE] == OK, m)  # connected again, and not enabled by itself
+    other.send(command)
+    until(lambda s: s.status[STATE] == ERROR, m)
+
+
 def test_the_master_id_of_the_binding_counts(bus):
     drive, m = bus.drive(5), bus.master(5, ", master_id: 99")
     m.backend.open()

@@ -49,6 +49,7 @@ from thermoctl_hal.can.set_up import (
 )
 
 _PRE_OPERATIONAL = 0x7F  # NMT state in a heartbeat; 0: the node has just booted
+_COMMANDS = 0x200, 0x300, 0x400, 0x500  # identifiers of RPDO 1 to 4, without the node id
 _SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
 _OFFLINE, _ENABLED, _FAULT = AMP_OFFLINE, AMP_ENABLED, AMP_FAULT  # numbers of C, by drive.pxd
 
@@ -90,6 +91,7 @@ class Cia402Device(Device):
             0x080 + self._node,
             0x180 + self._node,
             0x580 + self._node,
+            *(base + self._node for base in _COMMANDS),  # another master's
             *range(0x701, 0x780),  # heartbeats: the drive's, and a foreign one with our node id
         )
         self._status_word = self._fault_code = self._frames = self._emergencies = 0
@@ -134,7 +136,7 @@ class Cia402Device(Device):
     def read(self, sample: Sample, now_s: float) -> None:
         """Take TPDO 1, emergencies and the drive's heartbeat.
 
-        Raises HardwareError when the heartbeat is missing, or when another device sends ours."""
+        Raises HardwareError without its heartbeat, or when another device sends ours or the command."""
         port = self._port
         if port is None:
             raise HardwareError("not connected")
@@ -151,6 +153,11 @@ class Cia402Device(Device):
                 self._emergencies += 1
             elif kind == 0x700 + self._master - self._node:
                 raise foreign_heartbeat(self._master, self.binding.port)
+            elif 0x200 <= kind <= 0x500:
+                raise HardwareError(
+                    f"another device on {self.binding.port} sends the command 0x{kind + self._node:X} of node {self._node}: "
+                    "two masters would drive one axis; switch the other one off"
+                )
         if now_s - self._heard_s > self._patience_s:
             raise HardwareError(f"no heartbeat of node {self._node} for {self._patience_s * 1e3:.0f} ms")
 
