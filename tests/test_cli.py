@@ -1,5 +1,6 @@
 """The command line: commands by purpose, and mistakes answered by the command in which they were made."""
 
+import os
 import subprocess
 import sys
 
@@ -84,6 +85,36 @@ def test_every_command_lists_the_same_formats():
 def test_diagnose_names_a_plant_that_is_given_as_a_recording(capsys):
     assert cli.main(["diagnose", "plant.yaml", "run_1.csv", "--out", "out"]) == 2
     assert "--plant FILE is missing (--plant plant.yaml was meant?)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("simulate", "--plant", "plant.yaml", "run.csv", "--out", "run.csv"),
+        ("simulate", "--plant", "plant.yaml", "run.csv", "--plot", "run.csv"),
+        ("refit", "--plant", "plant.yaml", "run.csv", "--out", "./plant.yaml"),
+        ("recordings", "import", "run.csv", "--out", "link.csv"),
+        ("recordings", "export", "run.csv", "run.csv"),
+        ("recordings", "recover", "run.csv", "--out", "run.csv"),
+    ],
+)
+def test_no_result_is_written_over_a_file_that_was_read(tmp_path, monkeypatch, capsys, words):
+    """`simulate --out` of a recording's own name lost the recording."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("run.csv", "plant.yaml"):
+        (tmp_path / name).write_text("precious")
+    (tmp_path / "link.csv").symlink_to("run.csv")
+    assert cli.main(words) == 2
+    assert "is a file that the command reads; name another one" in capsys.readouterr().err
+    assert {(tmp_path / n).read_text() for n in ("run.csv", "plant.yaml")} == {"precious"}
+
+
+@pytest.mark.parametrize("word", ["/dev/zero", "pipe"])
+def test_a_device_or_a_pipe_is_no_recording(tmp_path, monkeypatch, capsys, word):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    assert cli.main(["recordings", "import", "--explain", word]) == 2
+    assert f"{word}: a pipe or a device" in capsys.readouterr().err
 
 
 def test_the_command_line_alone_loads_no_package():

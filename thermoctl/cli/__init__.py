@@ -8,6 +8,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from thermoctl import __version__
 from thermoctl.cli.commands import BY_PURPOSE, COMMANDS, GROUPS, call, takes_axis
@@ -117,11 +118,24 @@ def _parsed(top: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Name
     return args
 
 
+def _spare_inputs(args: argparse.Namespace) -> None:
+    """Raise InputError where a command would write its result over a file that it reads."""
+    for option in ("out", "plot"):
+        target = getattr(args, option, None)
+        if not isinstance(target, str) or not Path(target).is_file():
+            continue
+        others = (v if isinstance(v, list) else [v] for k, v in vars(args).items() if k != option)
+        for given in (g for group in others for g in group if isinstance(g, str) and Path(g).is_file()):
+            if Path(given).samefile(target):
+                raise InputError(f"{target}: is a file that the command reads; name another one to write")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status."""
     args = _parsed(parser(), sys.argv[1:] if argv is None else argv)
     try:
         which_rig.choose(args)
+        _spare_inputs(args)
         code = call(args.row, args)
         sys.stdout.flush()  # a full disk behind `> FILE` shows here
         return code

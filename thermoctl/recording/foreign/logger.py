@@ -43,6 +43,8 @@ def read_recording(
     the file. `how`: the other fields of `How`. Units are in `units`, guesses in `notes`."""
     path, said = Path(path), How(time, **how)
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: a pipe or a device; a file was expected (save its text in one first)")
         if _is_ours(path, said):
             try:
                 table = files.read_table(path)
