@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from thermoctl import cli
 from thermoctl.configuration import settings
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.tuning import write_values
@@ -58,6 +59,27 @@ def test_bad_configuration(tmp_path, old, new, says):
     first = text[: text.index(new)].count("\n") + 1
     if "end of stream" not in message:  # an open quote is noticed at the file's end
         assert first <= line <= first + 12, message  # at the place, or at the first value below it
+
+
+RIGS = [f for f in SIMULATED.parent.glob("**/*.yaml") if re.search("(?m)^socket:", f.read_text())]
+
+
+@pytest.mark.parametrize("mistake", ["contrl: {}\n", "loop: {period_s: 1 ms\n", "loop:\n\tperiod_s: 1 ms\n"])
+@pytest.mark.parametrize("file", RIGS, ids=lambda f: f.stem)
+def test_a_rig_can_be_stopped_while_its_file_has_a_mistake(tmp_path, capsys, file, mistake):
+    """An armed rig could not be disarmed while somebody edited its file."""
+    rig, broken = settings.load_rig(file), tmp_path / file.name
+    text = re.sub("(?m)^( *path:|socket: {path:) *[^ }#\n]+", r"\1 x/y.sock", file.read_text())
+    broken.write_text(mistake + text)
+    found = settings.for_stopping(str(broken))
+    folder = tmp_path / "x"
+    ends = [Path(p.socket.path).stem.removeprefix(Path(p.rig_socket).stem) for p in rig.axes]
+    assert [p.socket.path for p in found.parts] == [str(folder / f"y{end}.sock") for end in ends or [""]]
+    assert [p.axis for p in found.parts] == [p.axis for p in rig.parts]
+    assert cli.main(["stop", "--config", str(broken)]) == 0
+    said = capsys.readouterr()
+    assert "not running" in said.out and "stop needs this file's socket only" in said.err
+    assert cli.main(["arm", "--config", str(broken)]) == 2
 
 
 def test_what_is_in_force_is_written_and_taken_back(tmp_path):

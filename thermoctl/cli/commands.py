@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import sys
 from typing import Any
 
 from thermoctl.advice import command_table as advice
@@ -14,6 +15,7 @@ from thermoctl.daemon import command_table as daemon
 from thermoctl.devices import command_table as devices
 from thermoctl.diagnosis import command_table as diagnose
 from thermoctl.export import command_table as export
+from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet import command_table as fleet
 from thermoctl.identify import command_table as identify
 from thermoctl.plant import command_table as plant
@@ -39,16 +41,24 @@ def call(command: Command, args: argparse.Namespace) -> int:
     function = getattr(importlib.import_module(module), name)
     takes = command.takes.split()
     if "settings" in takes:
-        from thermoctl.configuration.settings import load_rig, load_settings
+        from thermoctl.configuration.settings import for_stopping, load_rig, load_settings
 
         each = command.name in EACH_AXIS and "#" not in args.config
         whole = each or command.name in WHOLE_RIG and "#" not in args.config
-        args.settings = load_rig(args.config) if whole else load_settings(args.config)
+        try:
+            args.settings = load_rig(args.config) if whole else load_settings(args.config)
+        except InputError as e:
+            if command.name not in SAFE:
+                raise
+            print(f"thermoctl: {e}; {command.name} needs this file's socket only", file=sys.stderr)
+            args.settings = for_stopping(args.config)
         if each and args.settings.axes:
             return _each_axis(function, takes, args)
     return (function(*(getattr(args, t) for t in takes)) if takes else function(args)) or 0
 
 
+SAFE = frozenset({"disarm", "stop"})
+"""Commands of the safe direction: they work with a configuration that has mistakes, too."""
 EACH_AXIS = frozenset({"status", "disarm", "reload", "latency"})
 """Commands that, without --axis, do their work for every axis of a rig, one after the other."""
 ALL_AXES = frozenset({"start", "stop", "restart", "virtual-rig", "service"})

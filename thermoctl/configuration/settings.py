@@ -30,6 +30,7 @@ from thermoctl.files.yamlfile import (
     decimal_comma,
     kind_of,
     load,
+    loads,
     number_of,
     suggest,
 )
@@ -417,6 +418,26 @@ def load_settings(path: str | Path, axis: str = "") -> Settings:
         names = ", ".join(part.axis for part in rig.axes)
         raise InputError(f"{path}: this rig has the axes {names}; name one by --axis")
     return rig
+
+
+_ANYTHING = """control: {kp: 1, ti_s: 1, td_s: 0, output_limit: 1}
+protection: {required: []}
+hal: {backend: simulated, plant: none}
+"""
+
+
+def for_stopping(path: str) -> Settings:
+    """Return settings that hold the sockets of a file, which may have mistakes elsewhere.
+
+    They serve to disarm and stop a running daemon, and nothing else. Raises InputError, OSError."""
+    file, _, axis = path.rpartition("#") if not Path(path).exists() else (path, "", "")
+    text = Path(file).read_text(errors="replace")
+    section = {m[1]: m[0] for m in re.finditer(r"(?ms)^(socket|axes):.*?(?=^[^\s#]|\Z)", text)}
+    rig = _settings(loads(_ANYTHING + section.get("socket", ""), file), file, DEFAULT)
+    indent = re.search(r"\n( +)[a-z]", section.get("axes", ""))
+    names = re.findall(rf"(?m)^{indent[1]}({_AXIS.pattern}):", section["axes"]) if indent else []
+    rig = dataclasses.replace(rig, axes=tuple(_named(rig, name, len(names)) for name in names))
+    return rig.of_axis(axis) if axis else rig
 
 
 def load_rig(path: str | Path) -> Settings:
