@@ -166,7 +166,8 @@ def commands_that_act() -> str:
         "**Which rig.** `--config FILE`, else `$THERMOCTL_CONFIG`, else `config/simulated.yaml` in the current folder, else "
         "`/etc/thermoctl/rig.yaml`. A command below prints the file that it chose by itself, on stderr. Whoever drives a rig holds the "
         "lock beside its socket; a command finds the daemon there, whether `thermoctl run`, `thermoctl start` or systemd started it.\n\n"
-        "**Which question.** Stopping and disarming never ask. `arm` and `setpoint` are a person's own act. A command that decides "
+        "**Which question.** Stopping and disarming never ask, and work while the file has a mistake. "
+        "`arm` and `setpoint` are a person's own act. A command that decides "
         "by itself how the rig moves says so and asks first.\n\n"
         + _table(
             ("command", "what it does", "question", "where another process holds the rig", "exit status"),
