@@ -283,6 +283,8 @@ CASES = (
     Case("Parquet with columns of every type", "mixed.parquet", _parquet, {"T": RISING, "P": POWER}),
     Case("Arduino Serial Plotter, milliseconds", "arduino.txt", rows("millis\tT\tP\n", "{k}\t{T}.0\t{P}"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),
     Case("Arduino plotter, labels", "plotter.txt", rows("", "time_ms:{k} T:{T}.0 P:{P}"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),
+    Case("Arduino monitor, times before the lines", "monitor.txt", rows("09:59:59.500 -> T,P\n", "10:00:{s}.000 -> {T},{P}"), {"T": RISING, "P": POWER}),
+    Case("Arduino monitor, without a header", "bare.txt", rows("", "10:00:{s}.000 -> {T};{P}"), {"column_2": RISING, "column_3": POWER}),
     Case("Campbell, array of parts of the date", "cr10x.dat", "year,doy,hhmm,T\n" + "".join(f"2026,60,{1000 + i},{20 + i}\n" for i in range(6)), {"T": RISING},
          [60.0 * i for i in range(6)]),
     Case("EnergyPlus", "eplusout.csv", "Date/Time,ROOM:Zone Mean Air Temperature [C](TimeStep)\n 03/01  23:50:00,20\n 03/01  24:00:00,21\n 03/02  00:10:00,22\n",

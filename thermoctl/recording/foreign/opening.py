@@ -51,6 +51,7 @@ _SEGMENT = re.compile(rb"(?ms)^Channels\t.*?^\*{3}End_of_Header\*{3}[^\n]*\n[^\n
 _ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and seconds
 SHOWN = 8192  # number of last bytes that show the digits of the last column
 FEW = 6  # least number of lines that show them
+_STAMPED = re.compile(rb"(?m)^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # Arduino's monitor before each line
 _SUFFIXES = {
     ".mf4": "mdf",
     ".mdf": "mdf",
@@ -164,6 +165,10 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
         notes.append("whole lines stand in quotes; read without them")
+    if 2 * len(_STAMPED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
+        separator = next((s for s in (b"\t", b";", b",") if s in text[:HEAD]), b" ")
+        text = re.sub(_STAMPED.pattern + rb"(?=[^\W\d])", b"time" + separator, text, count=1)  # the header
+        text = _STAMPED.sub(lambda m: m[1] + separator, text)
     text, depth = _innermost(text)
     if depth:
         notes.append(f"the rows of the innermost of {depth + 1} nested tables read")
