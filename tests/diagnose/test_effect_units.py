@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.plants import VOICE_COIL
+from tests.plants import TANK, VOICE_COIL
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
@@ -47,19 +47,25 @@ def test_what_a_speed_or_a_flow_does_is_offered_and_keeps_its_units(unit, names,
         assert c.own(c.effect.parameters[0].name) in load(tmp_path / "extended.yaml").parameters
 
 
-def test_every_entry_keeps_the_units_of_a_rig_that_moves_and_heats(tmp_path):
-    (tmp_path / "plant.yaml").write_text(VOICE_COIL)
+VESSEL = TANK.replace("storage: 1,", "storage: A,").replace("parameters:", 'parameters:\n  A: {value: 1, unit: "1"}')
+RIGS = [
+    (VOICE_COIL, {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf", "inductance"}),
+    (VESSEL, {"overflow", "orifice_exponent"}),
+]
+
+
+@pytest.mark.parametrize("sample", [0.002, 1.0, 2.0])  # a factor of one vanishes from a product, with its unit
+@pytest.mark.parametrize(("text", "names"), RIGS, ids=["moves and heats", "flows"])
+def test_every_entry_keeps_the_units_of_a_rig_at_any_sampling(text, names, sample, tmp_path):
+    (tmp_path / "plant.yaml").write_text(text)
     plant = load(tmp_path / "plant.yaml")
-    t = np.arange(0.0, 2.0, 0.002)
-    moving = {"current": np.sin(9 * t), "current_rate": 9 * np.cos(9 * t), "air": 20 + 0.1 * t}
-    table = Table(
-        "run", "run", t, moving | {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t}
-    )
+    t = sample * np.arange(1000.0)
+    moving = {"current": np.sin(t), "current_rate": np.cos(t), "air": 20 + np.sin(t), "pump": 1 + np.sin(t)}
+    still = {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t, "level_start": 1 + 0 * t}
+    table = Table("run", "run", t, moving | still | {"level": 1 + 0 * t})
     rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())
-    assert {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf"} < {
-        c.effect.name for c in found
-    }
+    assert names < {c.effect.name for c in found}
     for c in found:
         save(
             c.extend({p.name: p.null if p.typical is None else p.typical for p in c.effect.parameters}),

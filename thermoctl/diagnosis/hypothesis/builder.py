@@ -146,7 +146,9 @@ class _Builder:
                 shift = zero_of(unit) - zero_of(self._unit_of(name(air)))
                 symbols["reference"] = ex.add(name(air), num(shift))
         symbols["duration"] = num(self.rig.duration)
-        symbols["sample"] = num(float(f"{self.rig.sample:.6g}"))
+        # a parameter, since a bare number of 1 s would vanish from a product, and its unit with it
+        sample = Parameter(self.c.own("sample"), float(f"{self.rig.sample:.6g}"), "s")
+        self.parameters[sample.name], symbols["sample"] = sample, name(sample.name)
         return symbols
 
     def _parameter(self, p: EffectParameter, value: float, low: float, high: float) -> Parameter:
@@ -315,10 +317,9 @@ class _Builder:
     def _spill(self, what: Mapping[str, Any]) -> None:
         """Let what is above a level flow over: a share into the next node, if there is one, the rest out.
 
-        The factor 2 / dt brings the level back to its limit within a sample."""
+        The factor 2 / sample brings the level back to its limit within a sample."""
         a, b = self.place.nodes["a"], self.place.nodes.get("b")
-        dt = self.symbols["sample"].value
-        over = ex.parse(f"max({a} - {self.c.own(what['level'])}, 0) * {2.0 / dt!r}")
+        over = self.expression(f"2 * max(a - {what['level']}, 0) / sample")
         over = ex.mul(over, self.base.nodes[a].storage)  # volume a second
         unit = next((f.unit for f in self.base.flows.values() if f.source == a), None)
         if b:
