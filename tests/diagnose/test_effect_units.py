@@ -47,21 +47,30 @@ def test_what_a_speed_or_a_flow_does_is_offered_and_keeps_its_units(unit, names,
         assert c.own(c.effect.parameters[0].name) in load(tmp_path / "extended.yaml").parameters
 
 
-VESSEL = TANK.replace("storage: 1,", "storage: A,").replace("parameters:", 'parameters:\n  A: {value: 1, unit: "1"}')
+VESSEL = TANK.replace("storage: 1,", "storage: A,").replace(
+    "parameters:", 'parameters:\n  A: {value: 1, unit: "1"}'
+)
 RIGS = [
     (VOICE_COIL, {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf", "inductance"}),
     (VESSEL, {"overflow", "orifice_exponent"}),
 ]
 
 
-@pytest.mark.parametrize("sample", [0.002, 1.0, 2.0])  # a factor of one vanishes from a product, with its unit
+@pytest.mark.parametrize(
+    "sample", [0.002, 1.0, 2.0]
+)  # a factor of one vanishes from a product, with its unit
 @pytest.mark.parametrize(("text", "names"), RIGS, ids=["moves and heats", "flows"])
 def test_every_entry_keeps_the_units_of_a_rig_at_any_sampling(text, names, sample, tmp_path):
     (tmp_path / "plant.yaml").write_text(text)
     plant = load(tmp_path / "plant.yaml")
     t = sample * np.arange(1000.0)
     moving = {"current": np.sin(t), "current_rate": np.cos(t), "air": 20 + np.sin(t), "pump": 1 + np.sin(t)}
-    still = {"position_read": 0 * t, "voltage": 0 * t, "coil_temperature": 20 + 0 * t, "level_start": 1 + 0 * t}
+    still = {
+        "position_read": 0 * t,
+        "voltage": 0 * t,
+        "coil_temperature": 20 + 0 * t,
+        "level_start": 1 + 0 * t,
+    }
     table = Table("run", "run", t, moving | still | {"level": 1 + 0 * t})
     rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())

@@ -113,13 +113,16 @@ def test_every_effect_has_the_same_places_whatever_the_names_and_units(other):
     assert _places(other(rig)) == _places(rig)
 
 
-def test_the_air_stays_the_ambient_behind_a_slow_thermometer():
-    """A drift with the air was placed before the lag, and could then not be added: KeyError 'air'."""
-    _, structure, table = _read(blocks())
-    lag = next(c for c in candidates(structure, catalogue()) if c.key == ("sensor_lag", "air"))
-    plant = lag.extend({"TAU": 30.0})
-    slow = Rig(plant, [compile_plant(plant).excitation(table)], [dict(table.columns)])
-    assert structure.air == slow.air == "air"
+@pytest.mark.parametrize("between", ["hold", "linear"])
+def test_the_air_stays_the_ambient_beside_every_effect(between):
+    """A drift with the air was placed before a slow thermometer, and could then not be added: KeyError 'air'."""
+    rig = blocks()
+    rig.plant["inputs"]["air"]["between_samples"] = between
+    _, structure, table = _read(rig)
+    for c in candidates(structure, catalogue()):
+        plant = c.extend({})
+        beside = Rig(plant, [compile_plant(plant).excitation(table)], [dict(table.columns)])
+        assert beside.air == structure.air == "air", c.key
 
 
 def test_the_order_of_keys_decides_nothing_but_the_order_of_pairs():

@@ -209,7 +209,7 @@ class Rig:
         slow = [
             f.rate for f in self.physics.flows.values() if f.target in found and _READINGS.match(f.target)
         ]
-        return found.union(*map(ex.names, slow))
+        return {n.removesuffix(STRAIGHT) for n in found.union(*map(ex.names, slow))}
 
     def _mean(self, signal: str) -> float:
         if signal in self.plant.parameters:

@@ -49,6 +49,7 @@ class Overlay:
 
     def __init__(self, base: Plant, extended: Plant):
         self.base, self.states = base, list(base.nodes)
+        self.start = {k: p.value for k, p in extended.parameters.items() if k not in base.parameters}
         self.new = [(n, _net(extended, k)) for k, n in extended.nodes.items() if k not in base.nodes]
         self.flows = [
             (f, old)
@@ -71,9 +72,9 @@ class Overlay:
     ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return the changes (N,) along a trajectory: of slopes dx/dt by state, and of outputs by output.
 
-        `values`: of the extension's parameters."""
+        `values`: of the extension's parameters, if they are not what it starts with."""
         base = self.base
-        extra: dict[str, np.ndarray | float] = dict(values)
+        extra: dict[str, np.ndarray | float] = {**self.start, **values}
         for n, net in self.new:
             extra[n.name] = _new_node(n, net, extra, trajectory)
         nets: dict[str, np.ndarray] = {}
