@@ -260,10 +260,11 @@ def _parameters(
     true: Sequence[Mapping[str, float]],
     findings: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Compare the parameters of correctly named findings: error, coverage (`A_1` is `A`)."""
+    """Compare the parameters of right findings: error, coverage (`A_1` is `A`), whether they are names."""
     rows = []
-    for (effect, _), values in zip(truth, true, strict=False):
-        found = next((f for f in findings if f["effect"] == effect), None)
+    for (effect, place), values in zip(truth, true, strict=False):
+        right = (f for f in findings if f["effect"] == effect and same_place(effect, f["where"], place))
+        found = next(right, None)
         if found is None:
             continue
         for name, value in values.items():
@@ -278,6 +279,7 @@ def _parameters(
                         "parameter": name,
                         "error": abs(estimate["value"] / value - 1),
                         "covered": abs(estimate["value"] - value) <= wide,
+                        "named": float(found["probability"]) >= CONFIDENT,
                     }
                 )
     return rows

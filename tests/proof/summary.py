@@ -100,7 +100,8 @@ def _shares(rows: Sequence[Row]) -> dict[str, Share]:
         "confidently_misnamed": share(r.verdict in NAMING[:2] and r.confident for r in unknown),
         "pairs_both_right": share(r.alike for r in two),
         "pairs_one_right": share(any(f[0] in {e for e, _ in r.truth} for f in r.findings) for r in two),
-        "interval_coverage": share(p["covered"] for r in rows for p in r.parameters),
+        "interval_coverage": share(p["covered"] for r in rows for p in r.parameters if p["named"]),
+        "interval_coverage_all": share(p["covered"] for r in rows for p in r.parameters),
         "failed": share(r.verdict == "failed" for r in rows),
     }
 

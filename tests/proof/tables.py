@@ -30,7 +30,8 @@ _TITLES = {
     "confidently_misnamed": "unknown named with confidence",
     "pairs_both_right": "pairs: both right",
     "pairs_one_right": "pairs: at least one right",
-    "interval_coverage": "95 % intervals that hold the parameter",
+    "interval_coverage": "95 % intervals of names that hold the parameter",
+    "interval_coverage_all": "the same, of all right findings",
     "failed": "diagnosis failed",
 }
 _NUMBERS = {

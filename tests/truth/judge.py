@@ -47,9 +47,8 @@ def row(case: Case, result: Mapping[str, Any] | None, cpu_s: float, error: str |
         for f in findings
     ]
     sure = [n for f in findings if f["probability"] >= CONFIDENT for n in meant(f)]
-    parameters = (
-        score(case.job.name, case.answer, result).parameters if "nearly_the_same" in case.answer else []
-    )
+    scored = score(case.job.name, case.answer, result).parameters if "nearly_the_same" in case.answer else []
+    parameters = [p for p in scored if p["named"]]
     return {
         "group": case.group,
         "verdict": (result or {"verdict": "failed"})["verdict"],
