@@ -25,6 +25,7 @@ from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor: an axis
 # that sticks rests for a long time.
+SHORTEST = 0.1  # shortest lag of a sensor, in sampling intervals
 STICKING = 300.0
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
@@ -95,6 +96,8 @@ def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | No
         return max(p.low, direction.shape["least"]), direction.shape["most"]
     if kind == "delays":
         return 0.0, max(value * 8, 0.05 * duration)
+    if kind == "lags":  # a shorter one only draws a held input straight
+        return max(SHORTEST * direction.candidate.rig.sample, value / 30), value * 30
     if p.shape:
         least = STICKING if kind == "creep_speeds" else 30
         return max(p.low, value / least), min(p.high, value * 30)
