@@ -264,12 +264,15 @@ def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
     ]
 
 
-def test_rounds_end_when_nothing_is_left_to_ask(tmp_path):
+@pytest.mark.parametrize(
+    "last", [None, {"profile": "c", "bits": 0.004}], ids=["none", "none that is worth rig time"]
+)
+def test_rounds_end_when_nothing_is_left_to_ask(last, tmp_path):
     results = iter(
         [
-            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "a"}},
-            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "b"}},
-            {"verdict": "explained", "findings": [], "next_experiment": None},
+            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "a", "bits": 0.5}},
+            {"verdict": "ambiguous", "findings": [], "next_experiment": {"profile": "b", "bits": 0.1}},
+            {"verdict": "explained", "findings": [], "next_experiment": last},
         ]
     )
     asked, ran = [], []

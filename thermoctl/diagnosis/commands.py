@@ -21,7 +21,7 @@ from rich.table import Table
 from thermoctl.checks.commands import checked, report
 from thermoctl.diagnosis import run
 from thermoctl.diagnosis.experiment.file import peaks
-from thermoctl.diagnosis.experiment.resolve import resolve
+from thermoctl.diagnosis.experiment.resolve import resolve, worth_running
 from thermoctl.diagnosis.law.result import save_effect
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import sentences, what_next
@@ -225,9 +225,11 @@ def _print(console: Console, rows: figures.Rows) -> None:
 
 
 def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
-    return [
+    lines = [
         f"next experiment: {entry['profile']}. {entry['why']} {entry['also_helpful'] or ''}",
         *(f"    {line}" for line in peaks(entry)),
-        f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
-        "or let `thermoctl diagnose --resolve` do it",
     ]
+    if worth_running(entry):
+        by_hand = f"run it: thermoctl experiment {out / entry['file']}  (or by hand: next_experiment.csv), "
+        lines.append(by_hand + "or let `thermoctl diagnose --resolve` do it")
+    return lines

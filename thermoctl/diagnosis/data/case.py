@@ -182,6 +182,8 @@ def case(
     ]
     tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
+    kept = [np.where(np.isfinite(d.y), e, np.nan) for d, e in zip(drives, null.residuals, strict=True)]
+    null = dataclasses.replace(null, residuals=kept)
     coordinates = Coordinates(drives)
     left_out = [outlier_note(dropped)] if dropped else []
     averaged = [fewer.note] if fewer.block > 1 else []

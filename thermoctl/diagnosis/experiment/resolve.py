@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnosis.experiment.file import FILES
 from thermoctl.files.safe_file import write_text
+
+LEAST_BITS = 0.06  # an experiment that tells less is not worth rig time
+
+
+def worth_running(proposed: Mapping[str, Any] | None) -> bool:
+    """Return whether a proposed experiment tells enough for rig time."""
+    return proposed is not None and proposed["bits"] >= LEAST_BITS
 
 
 def resolve(
@@ -19,7 +26,7 @@ def resolve(
     rounds: int,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Diagnose; while an experiment is proposed, run it and diagnose again, `rounds` times at most.
+    """Diagnose; while a proposed experiment is worth it, run it and diagnose again, `rounds` times at most.
 
     `diagnosed(recordings)` writes a result into `out`; `record(experiment, recording)` runs an experiment
     file on the rig; `say` is called in each round. The last result lists the experiments and verdicts in
@@ -27,7 +34,7 @@ def resolve(
     paths, history = list(recordings), []
     result = diagnosed(paths)
     for k in range(1, rounds + 1):
-        if not result["next_experiment"]:
+        if not worth_running(result["next_experiment"]):
             break
         before = {
             "verdict": result["verdict"],

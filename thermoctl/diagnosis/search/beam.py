@@ -382,10 +382,11 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
             s.refuse(parent.fitted.hypothesis.keys | {d.candidate.key for d in added}, f)
             if f and not f.absent:
                 (doubtful if f.doubtful else out).append(s.weighed(f))
-            if f and (f.absent or f.doubtful):
+            if f:
+                stands = not (f.absent or f.doubtful)
+                more = simpler(added, gained if stands else gain, looked, where, limits, stands)
                 queued = {d.candidate.key for ds, _ in queue for d in ds}
-                more = simpler(added, gain, looked, where, limits)
-                queue += [x for x in more if x[0][0].candidate.key not in queued]
+                queue += [x for x in more if stands or x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 
