@@ -65,7 +65,9 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         say("looking for a law")
         ahead, quiet = s.best.score - parent.score, only_noise(case, s.best.fitted, limits)
         goal = Goal(ahead - NEAR, NEAR, True) if quiet else Goal(ahead - BEATEN, 0.0, False)
+        done = case.budget.fits_done
         laws = _laws(case, parent, alone, goal, limits, say)
+        case.budget.fits += case.budget.fits_done - done  # laws take no refits from the catalogue
         s.keep(laws)
         if s.best in laws:
             grow(s)

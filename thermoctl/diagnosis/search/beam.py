@@ -212,6 +212,7 @@ def swap(s: Search) -> None:
     them. The rest is refitted even if the budget is spent: misfit.py compares the effect with it. Where it is
     the best, promises were compared without its gain: the rest of each of its effects is extended again."""
     while True:
+        s.keep(simplified(s))
         best = s.best
         effects = best.fitted.hypothesis.effects
         # the rest of a single effect is the plant alone, which is extended first of all
@@ -231,17 +232,63 @@ def swap(s: Search) -> None:
             return
 
 
-def rebuilt(s: Search, effects: Sequence[Placed], values: Fitted, leader: Fitted | None) -> Weighed | None:
+def simplified(s: Search) -> list[Weighed]:
+    """Refit the best hypothesis with the simpler entry that an effect of it contains, from its values.
+
+    Where others lead by far, what the simpler entry promised was not worth a refit."""
+    best, found = s.best.fitted, []
+    for e in best.hypothesis.effects:
+        simple = s.case.catalogue.get(e.candidate.effect.contains or "")
+        if simple is None or not {p.name for p in simple.parameters if not p.amplitude} <= e.own.keys():
+            continue
+        keys = best.hypothesis.keys - {e.key} | {(simple.name, e.key[1])}
+        if keys in s.tried or keys in s.refused or s.case.budget.stopped():
+            continue
+        w = rebuilt(s, best.hypothesis.effects, best, best, {e.key: simple})
+        if w and not w.fitted.doubtful and not w.fitted.absent:
+            found.append(w)
+        else:
+            s.refuse(keys, w.fitted if w else None)
+    return found
+
+
+def rebuilt(
+    s: Search,
+    effects: Sequence[Placed],
+    values: Fitted,
+    leader: Fitted | None,
+    instead: Mapping[Key, Effect] | None = None,
+) -> Weighed | None:
     """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails.
 
-    It fails for a law: the catalogue has no place for it."""
-    case, known = s.case, values.rough_plant
+    It fails for a law: the catalogue has no place for it. `instead`: by effect, a simpler one that takes its
+    place."""
+    case, known, instead = s.case, values.rough_plant, instead or {}
     if any(e.key[0] not in case.catalogue for e in effects):
         return None
     parameters = {n: known.parameters.get(n, p) for n, p in case.plant.parameters.items()}
     plant = dataclasses.replace(case.plant, parameters=parameters)
-    entries = {e.key[0]: e.candidate.effect for e in effects}
-    return remade(s, placed_before(effects, known), plant, entries, leader)
+    entries = {e.key[0]: e.candidate.effect for e in effects} | {x.name: x for x in instead.values()}
+    before = [
+        _simpler(b, e.candidate.effect, instead[e.key]) if e.key in instead else b
+        for e, b in zip(effects, placed_before(effects, known), strict=True)
+    ]
+    return remade(s, before, plant, entries, leader)
+
+
+def _simpler(before: PlacedBefore, richer: Effect, simple: Effect) -> PlacedBefore:
+    """Return a simpler effect with the values of one that contains it: those of the same name.
+
+    The first amplitude is the richer one's: F is FC of Stribeck's friction."""
+    names = {p.name: p.name for p in simple.parameters if p.name in before.values}
+    first = [next((p.name for p in x.parameters if p.amplitude), "") for x in (simple, richer)]
+    names.setdefault(*first)
+    return PlacedBefore(
+        (simple.name, before.key[1]),
+        "",
+        {p: before.values[q] for p, q in names.items()},
+        {p: before.ranges[q] for p, q in names.items() if q in before.ranges},
+    )
 
 
 def remade(
@@ -382,11 +429,10 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
             s.refuse(parent.fitted.hypothesis.keys | {d.candidate.key for d in added}, f)
             if f and not f.absent:
                 (doubtful if f.doubtful else out).append(s.weighed(f))
-            if f:
-                stands = not (f.absent or f.doubtful)
-                more = simpler(added, gained if stands else gain, looked, where, limits, stands)
+            if f and (f.absent or f.doubtful):
                 queued = {d.candidate.key for ds, _ in queue for d in ds}
-                queue += [x for x in more if stands or x[0][0].candidate.key not in queued]
+                more = simpler(added, gain, looked, where, limits)
+                queue += [x for x in more if x[0][0].candidate.key not in queued]
     simplest = max((w.score for w in (parent, *out)), default=parent.score)
     return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
 

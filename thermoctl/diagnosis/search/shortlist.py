@@ -52,22 +52,16 @@ def simpler(
     looked: Screened,
     where: Mapping[str, set[str]],
     limits: Thresholds,
-    only: bool,
 ) -> list[Extension]:
-    """Return the simpler entries at the places of `added`, to try in its place.
+    """Return the simpler entries at the places of `added`, to try instead of an insignificant effect.
 
-    The entry that an effect contains may gain as much as this one, others what they promise themselves.
-    `only`: those that it contains."""
+    The entry that an effect contains may gain as much as this one, others what they promise themselves."""
     out: list[Extension] = []
     for d, promise in looked.promised:
         here = [a.candidate.effect for a in added if a.candidate.place.where == d.candidate.place.where]
         if d.gain > 0 and any(d.candidate.effect.name == a.contains for a in here):
             out.append(((d,), gain))
-        elif (
-            d.gain > 0
-            and not only
-            and any(len(d.candidate.effect.parameters) < len(a.parameters) for a in here)
-        ):
+        elif d.gain > 0 and any(len(d.candidate.effect.parameters) < len(a.parameters) for a in here):
             out.append(((d,), predicted(d, promise, where, limits)))
     return out
 
