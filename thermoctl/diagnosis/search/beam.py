@@ -285,7 +285,7 @@ def _simpler(before: PlacedBefore, richer: Effect, simple: Effect) -> PlacedBefo
     names.setdefault(*first)
     return PlacedBefore(
         (simple.name, before.key[1]),
-        "",
+        before.label,
         {p: before.values[q] for p, q in names.items()},
         {p: before.ranges[q] for p, q in names.items() if q in before.ranges},
     )
