@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from tests.plants import SPRING_STAGE
+from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.evidence.fit import Placed, fitted
+from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search import beam, shortlist
 from thermoctl.diagnosis.search.beam import Search, Weighed, grow
+from thermoctl.plant import loads
+from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 PLACE = "somewhere"
 
@@ -113,6 +122,7 @@ def test_what_is_left_of_the_best_meets_its_own_rivals(monkeypatch):
     s.case.budget.stopped = lambda: False
     s.known[frozenset()] = {"g": 40.0, "t": 80.0}  # with the gain of r, the promise of t reaches the best
     monkeypatch.setattr(beam, "rebuilt", lambda s, rest, *a: weighed(rest[0].key[0], 70.0))
+    monkeypatch.setattr(beam, "simplified", lambda s: [])
     beam.swap(s)
     assert s.best.fitted.hypothesis.keys == {("t", PLACE)}
 
@@ -126,3 +136,31 @@ def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, prom
     found = shortlist.elsewhere({("radiation", "there")}, 60.0, looked, [])
     assert [(d.candidate.key, gain) for (d,), gain in found] == [(("radiation", "here"), 60.0)] * tried
     assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked, [])
+
+
+@pytest.mark.parametrize(
+    ("richer", "sizes"),
+    [
+        ("stribeck_friction", {"W": 1e-3, "FC": 0.9, "FS": 0.3, "VS": 0.02}),
+        ("directional_friction", {"W": 1e-3, "F": 0.9, "D": 0.1, "H": 0.5}),
+    ],
+)
+def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
+    """Beside cogging, dry friction promised too little for a refit: a friction that contains it was named."""
+    t = np.arange(3000) * 0.002
+    truth = SPRING_STAGE.replace(
+        "damper:", "rub: {from: velocity, rate: 1.2 * tanh(velocity / 0.001)}\n  damper:"
+    )
+    force = Table("run", "run", t, {"force": 6 * np.sin(7 * t) + 3 * np.sin(23 * t)})
+    table = compile_plant(loads(truth)).measure(force, seed=1)
+    known = case(loads(SPRING_STAGE), [table], catalogue(), Budget(20))
+    s = beam.started(known, limits())
+    rig = known.rig(known.plant, known.drives(known.null.model))
+    c = next(c for c in candidates(rig, known.catalogue) if c.key == (richer, "velocity"))
+    plant = c.extend(sizes, {k: (-4.0 if k in "DH" else 0.0, 4.0) for k in sizes} | {"W": (1e-5, 0.1)})
+    s.keep([s.weighed(fitted(known, plant, (Placed(c, {p: c.own(p) for p in sizes}),)))])
+    (simple,) = beam.simplified(s)
+    assert simple.fitted.hypothesis.keys == {("coulomb_friction", "velocity")}
+    assert simple.fitted.plant.parameters["F_coulomb_friction_velocity"].value == pytest.approx(1.2, rel=0.02)
+    s.keep([simple])
+    assert not beam.simplified(s)
