@@ -235,7 +235,7 @@ def swap(s: Search) -> None:
 def simplified(s: Search) -> list[Weighed]:
     """Refit the best hypothesis with the simpler entry that an effect of it contains, from its values.
 
-    Where others lead by far, what the simpler entry promised was not worth a refit."""
+    Where others lead by far, the promise of the simpler entry was not worth a refit."""
     best, found = s.best.fitted, []
     for e in best.hypothesis.effects:
         simple = s.case.catalogue.get(e.candidate.effect.contains or "")
