@@ -291,6 +291,12 @@ def test_a_note_is_told_once_and_outliers_with_their_places():
 def test_a_parameter_is_shown_without_its_place():
     assert short("ALPHA_copper_resistance_a_b", {"effect": "copper_resistance", "where": "a-b"}) == "ALPHA"
     assert short("G_12", {"effect": "copper_resistance", "where": "a-b"}) == "G_12"
+    spill = {
+        "effect": "overflow",
+        "where": "top",
+        "equation": "max(top - HMAX_overflow_top, 0) * A * A_overflow_top",
+    }
+    assert [short(f"{n}_overflow_top", spill) for n in ("HMAX", "A")] == ["HMAX", "A_overflow_top"]
 
 
 @given(st.lists(st.floats(-50, 50), min_size=5, max_size=30), st.floats(0.01, 3))

@@ -145,11 +145,13 @@ def with_interval(value: float, sd: float | None, unit: str | None = None) -> st
 
 
 def short(parameter: str, finding: Result) -> str:
-    """Return the name of a finding's parameter without its suffix of effect and place."""
-    place = re.sub(r"[^A-Za-z0-9_]", "_", finding["where"])
+    """Return the name of a finding's parameter without its suffix of effect and place.
+
+    With it, where the equation has another quantity of the short name."""
+    place, name = re.sub(r"[^A-Za-z0-9_]", "_", finding["where"]), parameter
     for member in finding.get("members", [finding]):
-        parameter = parameter.removesuffix(f"_{member['effect']}_{place}")
-    return parameter
+        name = name.removesuffix(f"_{member['effect']}_{place}")
+    return parameter if re.search(rf"\b{name}\b", str(finding.get("equation", ""))) else name
 
 
 def equation(finding: Result) -> str:
