@@ -242,7 +242,8 @@ def simplified(s: Search) -> list[Weighed]:
         if simple is None or not {p.name for p in simple.parameters if not p.amplitude} <= e.own.keys():
             continue
         keys = best.hypothesis.keys - {e.key} | {(simple.name, e.key[1])}
-        if keys in s.tried or keys in s.refused or s.case.budget.stopped():
+        known = keys in s.tried or keys in s.refused or len(keys) < len(best.hypothesis.effects)
+        if known or s.case.budget.stopped():
             continue
         w = rebuilt(s, best.hypothesis.effects, best, best, {e.key: simple})
         if w and not w.fitted.doubtful and not w.fitted.absent:

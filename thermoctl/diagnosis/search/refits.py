@@ -97,7 +97,8 @@ def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | No
     if kind == "delays":
         return 0.0, max(value * 8, 0.05 * duration)
     if kind == "lags":  # a shorter one only draws a held input straight
-        return max(SHORTEST * direction.candidate.rig.sample, value / 30), value * 30
+        shortest = SHORTEST * direction.candidate.rig.sample
+        return max(shortest, value / 30), max(shortest, value) * 30
     if p.shape:
         least = STICKING if kind == "creep_speeds" else 30
         return max(p.low, value / least), min(p.high, value * 30)
