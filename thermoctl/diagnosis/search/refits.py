@@ -23,9 +23,9 @@ from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
+SHORTEST = 0.1  # shortest lag of a reading of held inputs, in sampling intervals
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor: an axis
 # that sticks rests for a long time.
-SHORTEST = 0.1  # shortest lag of a sensor, in sampling intervals
 STICKING = 300.0
 START = 10.0  # factor on the catalogue's standard deviation of an initial state that nobody measured
 
@@ -84,8 +84,8 @@ def ranges_of(direction: Direction) -> dict[str, tuple[float, float]]:
 
 
 def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | None:
-    value, duration = direction.start[p.name], direction.candidate.rig.duration
-    kind = direction.candidate.effect.shapes.get(p.shape or "", "")
+    c = direction.candidate
+    value, duration, kind = direction.start[p.name], c.rig.duration, c.effect.shapes.get(p.shape or "", "")
     if p.shape in TIMES:
         return (0.0, duration) if value <= duration else None
     if p.shape == "phase":
@@ -96,13 +96,13 @@ def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | No
         return max(p.low, direction.shape["least"]), direction.shape["most"]
     if kind == "delays":
         return 0.0, max(value * 8, 0.05 * duration)
-    if kind == "lags":  # a shorter one only draws a held input straight
-        shortest = SHORTEST * direction.candidate.rig.sample
+    if any("straight" in change for change in c.effect.changes[c.variant]):
+        shortest = SHORTEST * c.rig.sample  # a shorter lag only draws a held input straight
         return max(shortest, value / 30), max(shortest, value) * 30
     if p.shape:
         least = STICKING if kind == "creep_speeds" else 30
         return max(p.low, value / least), min(p.high, value * 30)
-    floor, ceiling = direction.candidate.bounds(p)
+    floor, ceiling = c.bounds(p)
     if np.isfinite(floor) and np.isfinite(ceiling):
         return floor, ceiling
     if p.name == "C" and value > 0:
