@@ -38,7 +38,8 @@ BESIDE = {  # command: (arguments, exit status) by which a person who means some
     "experiment": (["test_1", "--config", "{own}", "--out", "{root}.parquet"], 2),
     "calibrate": (["--config", "{own}", "--out", "{root}.calibration"], 2),
     "diagnose": (
-        ["--resolve", "--plant", "{plant}", "--out", "{root}.result", "--config", "{own}", "{recording}"], 2
+        ["--resolve", "--plant", "{plant}", "--out", "{root}.result", "--config", "{own}", "--limit", "heat=0:20",
+         "--limit", "T_body=0:200", "{recording}"], 2
     ),
 }  # fmt: skip
 MOVES_IT = {"tune", "experiment", "calibrate", "diagnose"}

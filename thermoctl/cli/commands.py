@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from pathlib import Path
 from typing import Any
 
 from thermoctl.advice import command_table as advice
@@ -48,7 +49,8 @@ def call(command: Command, args: argparse.Namespace) -> int:
         try:
             args.settings = load_rig(args.config) if whole else load_settings(args.config)
         except InputError as e:
-            if command.name not in SAFE:
+            file = args.config if Path(args.config).exists() else args.config.rpartition("#")[0]
+            if command.name not in SAFE or not Path(file).is_file():
                 raise
             print(f"thermoctl: {e}; {command.name} needs this file's socket only", file=sys.stderr)
             args.settings = for_stopping(args.config)
