@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from pathlib import Path
 from typing import Any
 
 from thermoctl.advice import command_table as advice
@@ -49,11 +48,13 @@ def call(command: Command, args: argparse.Namespace) -> int:
         try:
             args.settings = load_rig(args.config) if whole else load_settings(args.config)
         except InputError as e:
-            file = args.config if Path(args.config).exists() else args.config.rpartition("#")[0]
-            if command.name not in SAFE or not Path(file).is_file():
+            if command.name not in SAFE:
                 raise
+            try:
+                args.settings = for_stopping(args.config)
+            except OSError:  # no such file
+                raise e from None
             print(f"thermoctl: {e}; {command.name} needs this file's socket only", file=sys.stderr)
-            args.settings = for_stopping(args.config)
         if each and args.settings.axes:
             return _each_axis(function, takes, args)
     return (function(*(getattr(args, t) for t in takes)) if takes else function(args)) or 0

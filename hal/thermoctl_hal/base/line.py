@@ -22,7 +22,7 @@ from thermoctl_hal.base.profile import LineSettings
 
 NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter
-QUIET_S = 0.05  # longest pause within a line: an adapter holds bytes back
+QUIET_S = 0.05  # longest pause within a line or frame: an adapter holds bytes back
 MAX_LINE = 1024  # a text line longer than this is garbage
 _CHARACTERS = 6  # index of the special characters in termios' list
 

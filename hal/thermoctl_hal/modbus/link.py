@@ -30,7 +30,7 @@ from typing import Any
 
 from thermoctl.extras import load
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.base.line import NETWORK, open_port
+from thermoctl_hal.base.line import NETWORK, QUIET_S, open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
 
@@ -45,7 +45,6 @@ HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the lo
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
 GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
-QUIET_S = 0.05  # silence behind a frame, longer than an adapter holds bytes back
 CHUNK = 4096
 ATTEMPTS = 3  # largest number of times that a request is sent, if the server closes the connection
 _HOST = r"(\[[^]]+\]|[^:/]+):(\d+)/?"

@@ -66,21 +66,24 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         ahead, quiet = s.best.score - parent.score, only_noise(case, s.best.fitted, limits)
         goal = Goal(ahead - NEAR, NEAR, True) if quiet else Goal(ahead - BEATEN, 0.0, False)
         done = case.budget.fits_done
-        laws = _laws(case, parent, alone, goal, limits, say)
-        case.budget.fits += case.budget.fits_done - done  # laws take no refits from the catalogue
-        s.keep(laws)
-        if s.best in laws:
-            grow(s)
-            swap(s)
+        _compete(s, _laws(case, parent, alone, goal, limits, say), done)
     found = any(key[0] == LAW for key in s.best.fitted.hypothesis.keys)
     if not found and not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
         say("looking for laws at two places")
-        pairs = _pairs(s, limits)
-        s.keep(pairs)
-        if s.best in pairs:
-            grow(s)
-            swap(s)
+        done = case.budget.fits_done
+        _compete(s, _pairs(s, limits), done)
     return searched(s)
+
+
+def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
+    """Add laws to a search, and extend them where one leads.
+
+    Their refits, those since `done`, take none from the catalogue."""
+    s.case.budget.fits += s.case.budget.fits_done - done
+    s.keep(laws)
+    if s.best in laws:
+        grow(s)
+        swap(s)
 
 
 def _pays(case: Case, best: Weighed, limits: Thresholds) -> bool:

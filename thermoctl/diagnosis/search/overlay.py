@@ -72,7 +72,7 @@ class Overlay:
     ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return the changes (N,) along a trajectory: of slopes dx/dt by state, and of outputs by output.
 
-        `values`: of the extension's parameters, if they are not what it starts with."""
+        `values`: of the extension's parameters; the others have those of the extended plant."""
         base = self.base
         extra: dict[str, np.ndarray | float] = {**self.start, **values}
         for n, net in self.new:
