@@ -98,6 +98,14 @@ def test_without_findings_every_verdict_says_what_next(verdict, start):
     assert "budget of refits ended the search" in words(found)
 
 
+def test_an_unsure_law_is_told_with_its_expression():
+    law = LAG | {"effect": "law", "expression": "0.2 * max(reading - 3, 0)", "parameters": {}}
+    told = words(
+        FOUND | {"verdict": "ambiguous", "findings": [], "alternatives": [law | {"probability": 0.6}]}
+    )
+    assert "law 0.2 * max(reading - 3, 0) at reading (0.60)" in told
+
+
 def test_agreement_with_a_likely_effect_is_not_called_nothing_missing():
     found = FOUND | {"verdict": "consistent", "findings": [], "remainder": None, "truncated": False}
     assert "nothing is missing" in words(found) and "Nothing has to be done" in words(found)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +36,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
@@ -145,7 +147,8 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     assert [share for _, share, _ in survivors(undecided)] == pytest.approx([0.6, 0.4])
     entry, _ = propose(undecided)
     assert "current" in entry["inputs"]
-    assert entry["separates"][0]["hypothesis"].startswith("A1 * (current / Z1) / (abs(current / Z1) + s1)")
+    law_with_numbers = r"\(?[-\d.e]+\)? \* \(current / ([\d.]+)\) / \(abs\(current / \1\) \+ [\d.]+\)"
+    assert re.match(law_with_numbers, entry["separates"][0]["hypothesis"])
     undecided.law = replace(law, placed=replace(law.placed, rivals=()))
     assert propose(undecided) is None
 
@@ -434,6 +437,8 @@ def test_a_law_that_recordings_set_aside_do_not_confirm_is_no_finding():
     law = placed_law(d.searched.tried[0].fitted)
     assert {t.form.name: t.variables for t in law.proposal.terms} == {"total_product": {"current"}}
     assert d.law is None and d.refused == {("law", "cell")}
+    (told,) = (a["expression"] for a in contract(d)["alternatives"] if a["effect"] == "law")
+    assert "current" in told and re.search(r"\d", told)
 
 
 @pytest.mark.slow  # twenty seconds

@@ -19,7 +19,7 @@ from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, spoken
 from thermoctl.diagnosis.law.find import FoundLaw
-from thermoctl.diagnosis.law.refit import PlacedLaw
+from thermoctl.diagnosis.law.refit import PlacedLaw, equation, law_of
 from thermoctl.diagnosis.law.result import law_entry
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
@@ -146,6 +146,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "alternatives": [
                 {"effect": e, "where": w, "probability": round(p, 4)}
                 | ({"why_not": UNCONFIRMED} if (e, w) in d.refused else {})
+                | _expression(d, (e, w))
                 for (e, w), p in d.decision.alternatives
                 if (e, w) not in keys
             ],
@@ -273,6 +274,13 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
         **(_of_family(d, family) if family else {}),
     }
+
+
+def _expression(d: Diagnosis, key: Key) -> dict[str, str]:
+    """Return the likeliest expression of a law, with numbers; nothing for an effect of the catalogue."""
+    best = next(w.fitted for w in d.searched.tried if key in w.fitted.hypothesis.keys)
+    law = law_of(best)
+    return {"expression": equation(best, numbers=True)} if law and law.key == key else {}
 
 
 def _of_family(d: Diagnosis, f: Family) -> dict[str, Any]:

@@ -157,11 +157,13 @@ def at_bound(f: Fitted) -> bool:
     return any(set(names) & f.fit.at_bound.keys() for names in own)
 
 
-def equation(f: Fitted) -> str:
-    """Return the flow of the last law of a hypothesis with short names of its parameters."""
+def equation(f: Fitted, numbers: bool = False) -> str:
+    """Return the flow of the last law of a hypothesis with its parameters' short names or numbers."""
     law = law_of(f)
     assert law is not None
-    c, text = law.candidate, readable(law_rate(f))
+    c, text, values = law.candidate, readable(law_rate(f)), f.plant.parameters
     for q in c.effect.parameters:
-        text = re.sub(rf"\b{re.escape(c.own(q.name))}\b", q.name, text)
+        own = c.own(q.name)
+        shown = f"{values[own].value:.3g}" if numbers and own in values else q.name
+        text = re.sub(rf"\b{re.escape(own)}\b", f"({shown})" if shown.startswith("-") else shown, text)
     return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)

@@ -91,8 +91,8 @@ def family(law: FoundLaw) -> list[str]:
 
 
 def described(p: Proposal, f: Fitted) -> str:
-    """Return a law as an expression with its place."""
-    return f"{equation(f)} at {p.place.where}"
+    """Return a law as an expression with numbers, and its place."""
+    return f"{equation(f, numbers=True)} at {p.place.where}"
 
 
 def law_section(law: FoundLaw | None, entry: Mapping[str, Any] | None) -> str:

@@ -231,7 +231,12 @@ def parameter_rows(finding: Result) -> Rows:
 def alternative_rows(result: Result) -> Rows:
     """Return the alternatives, the likeliest first, each with the reason why it is not named."""
     rows = [
-        (_plain(a["effect"]), a["where"], chance(a["probability"]), a.get("why_not", ""))
+        (
+            f"{_plain(a['effect'])} {a.get('expression', '')}".strip(),
+            a["where"],
+            chance(a["probability"]),
+            a.get("why_not", ""),
+        )
         for a in result["alternatives"][:ALTERNATIVES]
     ]
     return ("alternative", "where", "probability", "but"), rows

@@ -77,8 +77,8 @@ def what_next(result: Result) -> str:
 
 
 def name(finding: Result) -> str:
-    """Return an effect and its place as text, with its duration or its times if it has any."""
-    text = str(finding["effect"]).replace("_", " ")
+    """Return an effect and its place as text, with its expression, duration or times if any."""
+    text = f"{str(finding['effect']).replace('_', ' ')} {finding.get('expression', '')}".strip()
     parameters = list(finding.get("parameters", {}).values())
     if len(parameters) == 1 and parameters[0]["unit"] == "s":
         text += f" of {parameters[0]['value']:.3g} s"
