@@ -50,7 +50,25 @@ def test_what_a_speed_or_a_flow_does_is_offered_and_keeps_its_units(unit, names,
 VESSEL = TANK.replace("storage: 1,", "storage: A,").replace(
     "parameters:", 'parameters:\n  A: {value: 1, unit: "1"}'
 )
+MOTOR = """format: thermoctl-plant/1
+title: A motor on a voltage, whose back electromotive force is left out
+inputs: {voltage: {unit: V}}
+parameters:
+  R: {value: 1.6, unit: ohm, range: [0.3, 6]}
+  L: {value: 0.005, unit: H, range: [0.0005, 0.05]}
+  J: {value: 7.0e-4, unit: kg*m^2, range: [1.0e-4, 1.0e-2]}
+  B: {value: 1.0e-4, unit: N*m*s/rad, range: [5.0e-6, 5.0e-3]}
+  K_t: {value: 0.082, unit: N*m/A}
+nodes: {i: {unit: A, storage: L, initial: 0, initial_sigma: 0.05}, w: {unit: rad/s, storage: J, initial: 0, initial_sigma: 0.5}}
+flows:
+  source: {into: i, rate: voltage, unit: V}
+  copper: {from: i, rate: R * i, unit: V}
+  torque: {into: w, rate: K_t * i, unit: N*m}
+  bearing: {from: w, rate: B * w, unit: N*m}
+outputs: {current: {value: i, unit: A, noise: 0.05}, speed: {value: w, unit: rad/s, noise: 0.5}}
+"""
 RIGS = [
+    (MOTOR, {"back_emf", "coulomb_friction", "constant_load"}),
     (VOICE_COIL, {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf", "inductance"}),
     (VESSEL, {"overflow", "orifice_exponent"}),
 ]
@@ -59,25 +77,28 @@ RIGS = [
 @pytest.mark.parametrize(
     "sample", [0.002, 1.0, 2.0]
 )  # a factor of one vanishes from a product, with its unit
-@pytest.mark.parametrize(("text", "names"), RIGS, ids=["moves and heats", "flows"])
-def test_every_entry_keeps_the_units_of_a_rig_at_any_sampling(text, names, sample, tmp_path):
+@pytest.mark.parametrize(("text", "names"), RIGS, ids=["turns", "moves and heats", "flows"])
+def test_every_entry_changes_a_rig_and_keeps_its_units_at_any_sampling(text, names, sample, tmp_path):
     (tmp_path / "plant.yaml").write_text(text)
     plant = load(tmp_path / "plant.yaml")
     t = sample * np.arange(1000.0)
-    moving = {"current": np.sin(t), "current_rate": np.cos(t), "air": 20 + np.sin(t), "pump": 1 + np.sin(t)}
+    moving = {"current_rate": np.cos(t), "air": 20 + np.sin(t), "pump": 1 + np.sin(t)}
     still = {
         "position_read": 0 * t,
         "voltage": 0 * t,
         "coil_temperature": 20 + 0 * t,
         "level_start": 1 + 0 * t,
+        "speed": 0 * t,
     }
-    table = Table("run", "run", t, moving | still | {"level": 1 + 0 * t})
+    moving["voltage" if text is MOTOR else "current"] = np.sin(t)
+    table = Table("run", "run", t, still | {"current": 0 * t, "level": 1 + 0 * t} | moving)
     rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())
     assert names < {c.effect.name for c in found}
     for c in found:
-        save(
-            c.extend({p.name: p.null if p.typical is None else p.typical for p in c.effect.parameters}),
-            tmp_path / "extended.yaml",
-        )
+        extended = c.extend({p.name: p.null if p.typical is None else p.typical for p in c.effect.parameters})
+        assert extended.parameters.keys() > plant.parameters.keys(), (
+            c.key
+        )  # those that no equation reads are left out
+        save(extended, tmp_path / "extended.yaml")
         load(tmp_path / "extended.yaml")

@@ -174,10 +174,11 @@ class _Builder:
         """Return the unit of a parameter; None where the plant does not state a unit that it depends on."""
         if text is None:
             return None
-        node, flows = self.place.nodes.get("v"), self.base.flows.values()
-        rates = (f.unit for f in flows if node and node in (f.source, f.target) and f.unit)
+        node = self.place.nodes.get("v") or self.place.nodes.get("a")
+        flows = (f for f in self.base.flows.values() if node and node in (f.source, f.target))
+        rate = next((f.unit for f in flows if f.unit), None)
         units = {of: self._unit_of(self.symbols.get(of[-1])) for of in UNITS_OF}
-        units |= {"unit_of_y": self._unit_of_y(), "unit_of_rate": next(rates, None)}
+        units |= {"unit_of_y": self._unit_of_y() or rate, "unit_of_rate": rate}
         for key, unit in units.items():
             if key in text:
                 if unit is None:
@@ -259,6 +260,13 @@ class _Builder:
                     self.flows[f.name], rate=ex.fill(self.flows[f.name].rate, swap)
                 )
             self.outputs = {k: _changed(o, lambda e: ex.fill(e, swap)) for k, o in self.outputs.items()}
+
+    def _voltage(self, form: str) -> None:
+        """Add a voltage to a reading, or take it from what drives the current of a node."""
+        if self.place.output:
+            self._value(f"y + {form}")
+        else:
+            self._new_flow(self.c.in_plant, self.expression(form), self.place.nodes["a"], None, None)
 
     def _storage(self, form: str) -> None:
         n = self.base.nodes[next(iter(self.place.nodes.values()))]

@@ -38,7 +38,8 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "displacement": ("y",),
     "member": ("y", "T"),
     "bending_pair": ("y", "TA", "TB"),
-    "voltage_sensor": ("y", "a"),
+    "voltage_sensor": ("y",),
+    "voltage": ("y", "a"),
     "level_node": ("a", "b"),
     "orifice": (),
     "resistive": (),
@@ -62,7 +63,7 @@ SHAPES: Mapping[str, tuple[str, ...]] = {
 """The kinds of shapes, and the names of the values that each kind has in `shape:` and `trial:`."""
 UNITS_OF = ("unit_of_y", "unit_of_rate", *(f"unit_of_{signal}" for signal in "vxuaiT"))
 """Units of parameters that depend on the place: those of its reading, its flow, and its signals."""
-FORMS = ("rate", "value", "storage", "drive", "resistance")
+FORMS = ("rate", "value", "voltage", "storage", "drive", "resistance")
 PARTS = {
     "flow": (("rate",), ("from", "into")),
     "node": (("name", "storage", "initial"), ("unit", "initial_sigma")),

@@ -178,9 +178,12 @@ def _voltages(rig: Rig) -> Iterator[Place]:
     for o in rig.physics.outputs.values():
         if rig.kind(o) == "voltage" and not any(_sources(rig, n) for n in ex.names(o.value)):
             yield Place(o.name, {"y": o.value}, output=o.name)
-    for n in rig.physics.nodes.values():
-        if rig.kind(n) == "current":
-            yield Place(n.name, {}, {"a": n.name})
+
+
+def _circuits(rig: Rig) -> Iterator[Place]:
+    """Yield where a voltage can be added: outputs that are voltages, and nodes that are currents."""
+    yield from _voltages(rig)
+    yield from _nodes((n.name for n in rig.physics.nodes.values() if rig.kind(n) == "current"), "a")
 
 
 def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
@@ -275,6 +278,7 @@ PLACES = {
     "member": _members,
     "bending_pair": _bending_pairs,
     "voltage_sensor": _voltages,
+    "voltage": _circuits,
     "level_node": _levels,
     "orifice": _orifices,
     "resistive": _resistive,
