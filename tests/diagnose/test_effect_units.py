@@ -67,8 +67,11 @@ flows:
   bearing: {from: w, rate: B * w, unit: N*m}
 outputs: {current: {value: i, unit: A, noise: 0.05}, speed: {value: w, unit: rad/s, noise: 0.5}}
 """
+SPINDLE = MOTOR.replace("nodes: {", "nodes: {x: {unit: rad, storage: 1, initial: 0}, ").replace(
+    "flows:", "flows:\n  turns: {into: x, rate: w}"
+)
 RIGS = [
-    (MOTOR, {"back_emf", "coulomb_friction", "constant_load"}),
+    (SPINDLE, {"back_emf", "cogging", "position_dependent_force_constant"}),
     (VOICE_COIL, {"position_dependent_conductance", "cogging", "cubic_stiffness", "back_emf", "inductance"}),
     (VESSEL, {"overflow", "orifice_exponent"}),
 ]
@@ -90,7 +93,7 @@ def test_every_entry_changes_a_rig_and_keeps_its_units_at_any_sampling(text, nam
         "level_start": 1 + 0 * t,
         "speed": 0 * t,
     }
-    moving["voltage" if text is MOTOR else "current"] = np.sin(t)
+    moving["voltage" if text is SPINDLE else "current"] = np.sin(t)
     table = Table("run", "run", t, still | {"current": 0 * t, "level": 1 + 0 * t} | moving)
     rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
     found = candidates(rig, catalogue())

@@ -183,7 +183,7 @@ def _voltages(rig: Rig) -> Iterator[Place]:
 def _circuits(rig: Rig) -> Iterator[Place]:
     """Yield where a voltage can be added: outputs that are voltages, and nodes that are currents."""
     yield from _voltages(rig)
-    yield from _nodes((n.name for n in rig.physics.nodes.values() if rig.kind(n) == "current"), "a")
+    yield from _nodes(rig.currents, "a")
 
 
 def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:

@@ -110,7 +110,7 @@ class Rig:
     - `physics`: the plant without the parts that an observer and effects of readings added
     - `pairs`: by velocity, its position, where the structure of the plant shows it; `position_of`: these, and
       the pairs that units show
-    - `temperatures`, `velocities`: nodes; `heat_inputs`: inputs that are temperatures
+    - `temperatures`, `velocities`, `currents`: nodes; `heat_inputs`: inputs that are temperatures
     - `moving_inputs`: those that change; `spare`: recorded columns that the plant does not read
     - `air`: the ambient; `duration`, `sample`: of the longest recording, and its shortest interval, s"""
 
@@ -130,6 +130,7 @@ class Rig:
         self.temperatures = [
             n.name for n in p.nodes.values() if self.kind(n) == "temperature" and not _READINGS.match(n.name)
         ]
+        self.currents = [n.name for n in p.nodes.values() if self.kind(n) == "current"]
         driven = {end for f in p.flows.values() for end in (f.source, f.target)}
         moving = [n.name for n in p.nodes.values() if self.kind(n) in MOVING and n.name in driven]
         self.position_of: dict[str, str] = {}
@@ -279,9 +280,9 @@ class Rig:
         return out
 
     def is_motor(self, f: Flow) -> bool:
-        """Return whether a flow is a force or a torque that an input drives."""
+        """Return whether a flow is a force or a torque that an input or a current drives."""
         moves = f.target in self.velocities or f.source in self.velocities
-        return moves and bool(ex.names(f.rate) & self.moving_inputs)
+        return moves and bool(ex.names(f.rate) & (self.moving_inputs | {*self.currents}))
 
     def is_pump(self, f: Flow) -> bool:
         """Return whether a flow enters from outside and is neither heat nor a force."""
