@@ -35,7 +35,7 @@ def test_an_effect_that_helps_in_one_part_only_is_not_confirmed():
     assert signed_rank(once) < 0.9 < signed_rank(always)
 
 
-def with_errors(energies, reserve=()):
+def with_errors(energies, reserve=(), misfit=True):
     """The test, on stated errors (parts, outputs) of each hypothesis instead of refits."""
     entries = catalogue()
 
@@ -43,7 +43,7 @@ def with_errors(energies, reserve=()):
         effects = [SimpleNamespace(key=k, candidate=SimpleNamespace(effect=entries[k[0]])) for k in keys]
         return SimpleNamespace(hypothesis=SimpleNamespace(effects=effects))
 
-    test = Confirm(SimpleNamespace(), {keys: tried(keys) for keys in energies}, reserve)
+    test = Confirm(SimpleNamespace(), {keys: tried(keys) for keys in energies}, reserve, misfit)
     test._known = {keys: np.log(np.array(e)[:, None]) for keys, e in energies.items()}
     return test
 
@@ -69,14 +69,15 @@ def test_a_weaker_effect_without_a_name_leaves_before_a_name():
     assert after.effects[B] == 0.6 and B not in asked
 
 
-def test_an_event_is_confirmed_by_another_recording_only():
+def test_an_event_beside_a_misfit_is_confirmed_by_another_recording_only():
     """A fan that starts is one course in time; a misfit, too, has some course in time."""
     helps = {NONE: np.full(8, 50.0), frozenset({DRIFT}): np.arange(1.0, 9.0)}
     posterior = Probabilities({frozenset({DRIFT}): 1.0}, {DRIFT: 1.0}, 1.0)
     kept, after, _ = confirmed(posterior, frozenset({DRIFT}), with_errors(helps), 0.9)
     assert kept == NONE and after.effects[DRIFT] == 0.5
-    kept, after, _ = confirmed(posterior, frozenset({DRIFT}), with_errors(helps, reserve=("run_3",)), 0.9)
-    assert kept == frozenset({DRIFT}) and after.effects[DRIFT] > 0.99
+    for test in (with_errors(helps, reserve=("run_3",)), with_errors(helps, misfit=False)):
+        kept, after, _ = confirmed(posterior, frozenset({DRIFT}), test, 0.9)
+        assert kept == frozenset({DRIFT}) and after.effects[DRIFT] > 0.99
 
 
 def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():

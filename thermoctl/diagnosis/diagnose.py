@@ -10,7 +10,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
-from thermoctl.diagnosis.evidence.levels import only_noise, remainder
+from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
@@ -161,10 +161,12 @@ def _chosen(
     if chosen not in tried:
         chosen = likeliest
     # beside known physics whose residual is only noise, there is no misfit that it could imitate
-    quiet = only_noise(known, tried[chosen].fitted, numbers) and not any(key[0] == LAW for key in chosen)
+    best = tried[chosen].fitted
+    quiet = only_noise(known, best, numbers) and not any(key[0] == LAW for key in chosen)
     if sought.reserve or not quiet:
         fits = {keys: w.fitted for keys, w in tried.items()}
-        found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve), numbers.name)
+        misfit = max(over_noise(known, best)) > numbers.clean
+        found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve, misfit), numbers.name)
         if found[0] == chosen or not quiet:
             return found
     # a recording set aside may know too little to confirm them; unconfirmed evidence counts less

@@ -162,18 +162,20 @@ def _draws(error: np.ndarray) -> float:
 class Confirm:
     """The test of the effects of one diagnosis. Each hypothesis is linearised once.
 
-    `tried`: the hypotheses; `reserve`: recordings that took no part in any choice."""
+    `tried`: the hypotheses; `reserve`: recordings that took no part in any choice; `misfit`: does one stay that
+    an event may imitate?"""
 
     case: Case
     tried: Mapping[Keys, Fitted]
     reserve: Sequence[Table]
+    misfit: bool
 
     def __post_init__(self) -> None:
         self._known: dict[Keys, np.ndarray | None] = {}
 
     def probability(self, home: Keys, key: Key) -> float:
         """Return the probability that an effect helps a hypothesis to predict."""
-        if not self.reserve and _is_event(self.tried[home], key):
+        if self.misfit and not self.reserve and _is_event(self.tried[home], key):
             return UNTOLD
         mine = self._log_energies(home)
         parts = [self._log_energies(keys) for keys in self.tried if keys < home and key not in keys]
