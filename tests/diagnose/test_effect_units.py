@@ -10,6 +10,7 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import load, save
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
+from thermoctl.units import conversion
 
 PLANT = """format: thermoctl-plant/1
 title: A motor's housing
@@ -105,3 +106,23 @@ def test_every_entry_changes_a_rig_and_keeps_its_units_at_any_sampling(text, nam
         )  # those that no equation reads are left out
         save(extended, tmp_path / "extended.yaml")
         load(tmp_path / "extended.yaml")
+
+
+SCALE = """format: thermoctl-plant/1
+title: A slide whose linear scale grows; position in mm, its error in um
+inputs: {heat: {unit: W}, x: {unit: mm, role: position}, air: {unit: degC, between_samples: linear}}
+parameters: {C: {value: 300, unit: J/K}, H: {value: 1, unit: W/K}, A: {value: 2, unit: um/K, range: [0, 9]}}
+nodes: {rail: {unit: degC, storage: C, initial: air}}
+flows: {joule: {into: rail, rate: heat, unit: W}, loss: {from: rail, rate: H * (rail - air), unit: W}}
+outputs: {error: {value: A * (rail - 20), unit: um, noise: 0.1}}
+"""
+
+
+def test_an_expansion_of_the_scale_has_the_units_of_reading_and_position(tmp_path):
+    (tmp_path / "plant.yaml").write_text(SCALE)
+    plant, t = load(tmp_path / "plant.yaml"), np.arange(100.0)
+    table = Table("run", "run", t, {"heat": np.sin(t), "x": np.cos(t), "air": 20 + 0 * t, "error": 0 * t})
+    rig = Rig(plant, [compile_plant(plant).excitation(table)], [table.columns])
+    (found,) = (c for c in candidates(rig, catalogue()) if c.key == ("scale_expansion", "error"))
+    unit = found.extend({"A": 1e-5}).parameters[found.own("A")].unit
+    assert conversion(unit, "um/(mm*K)") == (1.0, 0.0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces
+from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
@@ -82,7 +83,8 @@ def sought(
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
     (chosen_on, notes), (reserve, _) = (in_pieces(plant, part) for part in split(tables, held_out))
-    known = case(plant, chosen_on, entries, Budget(numbers.fits, say, stopped), memory)
+    budget = Budget(numbers.fits, say, stopped)
+    known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
     known.notes.extend(notes)
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))

@@ -162,8 +162,8 @@ def _draws(error: np.ndarray) -> float:
 class Confirm:
     """The test of the effects of one diagnosis. Each hypothesis is linearised once.
 
-    `tried`: the hypotheses; `reserve`: recordings that took no part in any choice; `misfit`: does one stay that
-    an event may imitate?"""
+    `tried`: the hypotheses; `reserve`: recordings that took no part in any choice; `misfit`: does one stay
+    that an event may imitate?"""
 
     case: Case
     tried: Mapping[Keys, Fitted]

@@ -1,0 +1,59 @@
+"""A heater that switches between the rows of a logger is read on straight lines; one that switches at rows is held."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.plants import ONE_BLOCK
+from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.evidence.between import between
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.plant import load
+from thermoctl.recording.table import Table
+
+C, G, AIR, EVERY_S = 4.8, 0.06, 20.0, 2.0
+
+
+def recording(between: bool, seed: int) -> Table:
+    """Rows every two seconds; the exact solution from switch to switch of a relay's heat of 6 W."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, 1200, EVERY_S)
+    times = np.cumsum(rng.uniform(15, 60, 60))
+    times = times if between else np.round(times / EVERY_S) * EVERY_S
+    edges = np.sort(np.concatenate([t, times[times < t[-1]]]))
+    on = lambda at: 6.0 * (np.searchsorted(times, at, "right") % 2)  # noqa: E731
+    x, at = [AIR], {0.0: AIR}
+    for a, b in zip(edges, edges[1:], strict=False):
+        end = AIR + on(a) / G
+        x.append(end + (x[-1] - end) * np.exp(-G / C * (b - a)))
+        at[b] = x[-1]
+    read = np.array([at[s] for s in t]) + rng.normal(0, 0.1, len(t))
+    return Table(f"run_{seed}", "run", t, {"heat": on(t), "air": np.full(len(t), AIR), "temperature": read})
+
+
+def taken(text: str, between_rows: bool, folder: Path) -> Case:
+    (folder / "plant.yaml").write_text(text)
+    runs = [recording(between_rows, 1), recording(between_rows, 2)]
+    return between(load(folder / "plant.yaml"), lambda p: case(p, runs, catalogue(), Budget(80)))
+
+
+@pytest.mark.parametrize("between_rows", [True, False])
+def test_inputs_go_on_as_the_plant_alone_follows_them_better(between_rows, tmp_path):
+    known = taken(ONE_BLOCK, between_rows, tmp_path)
+    assert known.plant.inputs["heat"].linear == between_rows
+    assert any("straight lines between the rows of 'heat'" in note for note in known.notes) == between_rows
+
+
+def test_what_the_plant_file_states_is_not_asked(tmp_path):
+    text = ONE_BLOCK.replace("{unit: W}", "{unit: W, between_samples: hold}", 1)
+    assert not taken(text, True, tmp_path).plant.inputs["heat"].linear
+
+
+def test_switches_between_rows_are_no_missing_physics(tmp_path):
+    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
+    runs = [recording(True, 1), recording(True, 2)]
+    found = diagnose(load(tmp_path / "plant.yaml"), runs, catalogue(), limits())
+    assert not found.decision.named
