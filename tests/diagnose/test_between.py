@@ -7,10 +7,8 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, Case, case
-from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import load
 from thermoctl.recording.table import Table
 
@@ -50,10 +48,3 @@ def test_inputs_go_on_as_the_plant_alone_follows_them_better(between_rows, tmp_p
 def test_what_the_plant_file_states_is_not_asked(tmp_path):
     text = ONE_BLOCK.replace("{unit: W}", "{unit: W, between_samples: hold}", 1)
     assert not taken(text, True, tmp_path).plant.inputs["heat"].linear
-
-
-def test_switches_between_rows_are_no_missing_physics(tmp_path):
-    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
-    runs = [recording(True, 1), recording(True, 2)]
-    found = diagnose(load(tmp_path / "plant.yaml"), runs, catalogue(), limits())
-    assert not found.decision.named
