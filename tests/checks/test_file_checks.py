@@ -39,6 +39,16 @@ def test_a_wrong_sign_is_named_with_its_place(old, new, kind, where):
 def test_a_scale_that_no_recording_gives():
     (finding,) = file_findings(loads(OPEN))
     assert finding.kind == "scale" and "ratios of C_1, C_2, G_1, G_12, G_2, P:" in finding.what
+    later = OPEN.replace(
+        "rate: G_2 * (two - air)", "rate: G_2 * (two - air) * (1 + A * step(t - T0))"
+    ).replace(
+        "  C_1:",
+        "  A: {value: -0.3, range: [-0.9, 3]}\n  T0: {value: 900, unit: s, range: [0, 3600]}\n  C_1:",
+        1,
+    )
+    assert [f.what for f in file_findings(loads(later))] == [
+        finding.what
+    ]  # a step that comes later has no scale
     fixed = OPEN.replace("P: {value: 1, range: [0.1, 10]}", "P: {value: 1}")
     assert file_findings(loads(fixed)) == []
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from thermoctl.checks.finding import Finding
@@ -81,7 +83,7 @@ def _scales(plant: Plant) -> list[Finding]:
     """Find parameters that can all be multiplied by one factor without any change of a reading.
 
     A part of the network has such a scale if its storages and rates are homogeneous of degree 1 in them.
-    Euler's theorem shows it: sum p df/dp = f."""
+    Euler's theorem shows it: sum p df/dp = f. Parameters that act later, such as a step's, are left out."""
     free = {p.name for p in plant.parameters.values() if p.range}
     read = frozenset().union(
         *(ex.names(o.value) for o in plant.outputs.values()),
@@ -91,7 +93,7 @@ def _scales(plant: Plant) -> list[Finding]:
     for part in _parts(plant):
         flows = [f for f in plant.flows.values() if {f.source, f.target} & part]
         exprs = [f.rate for f in flows] + [plant.nodes[n].storage for n in part]
-        scaled = free & frozenset().union(*map(ex.names, exprs))
+        scaled = {q for q in free & frozenset().union(*map(ex.names, exprs)) if _acts(plant, exprs, q)}
         if scaled and not scaled & read and all(_homogeneous(plant, e, scaled) for e in exprs):
             names = ", ".join(sorted(scaled))
             findings.append(
@@ -117,6 +119,11 @@ def _parts(plant: Plant) -> list[set[str]]:
                 a |= b
                 parts.remove(b)
     return parts
+
+
+def _acts(plant: Plant, exprs: Sequence[Expr], parameter: str) -> bool:
+    slopes = [ex.derivative(e, parameter) for e in exprs]
+    return any(value_of(s, _values(plant, seed)) for s in slopes for seed in range(POINTS))
 
 
 def _homogeneous(plant: Plant, e: Expr, parameters: set[str]) -> bool:
