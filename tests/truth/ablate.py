@@ -117,7 +117,7 @@ RULES: Mapping[str, Rule] = {
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
     ),
-    "event": Rule("an event needs a recording set aside", {"verdict.confirm._is_event": _no}),
+    "event": Rule("beside a misfit an event needs a recording set aside", {"verdict.confirm._is_event": _no}),
     "only noise": Rule(
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
     ),
@@ -139,6 +139,11 @@ RULES: Mapping[str, Rule] = {
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
         {"diagnose.flow_missing": lambda *a: Missing()},
+    ),
+    "between": Rule(
+        "inputs go on in straight lines where the plant alone follows the recordings better so",
+        {"diagnose.between": lambda plant, made: made(plant)},
+        searches=True,
     ),
     "energy": Rule(
         "where the error is twice the noise, effects are proposed by their gain in energy, too",
