@@ -153,8 +153,9 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
         return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
     what = "A small systematic error stays" if _small(rows) else "Something is missing"
     doubted = listed([name(a) for a in result["alternatives"] if a.get("why_not")][:2])
-    fits = f" What would fit, and nothing else confirms: {doubted}." if doubted else ""
-    return f"{what} that no effect of the catalogue explains.{fits}"
+    if doubted:
+        return f"{what}. What would fit, though nothing else confirms it: {doubted}."
+    return f"{what} that no effect of the catalogue explains."
 
 
 def _families(result: Result) -> list[str]:
