@@ -14,7 +14,7 @@ import yaml
 from tests.bench.scale import block_plant
 from tests.laws.prove import EQUAL, cases, difference
 from tests.laws.real import law_of
-from tests.laws.rigs import LAWS, RELAYS, STORAGES, make
+from tests.laws.rigs import LAWS, RELAYS, STORAGES, TANKS, make
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
@@ -31,7 +31,7 @@ from thermoctl.diagnosis.law.forms import Term, families, library
 from thermoctl.diagnosis.law.propose import PROPOSALS, propose_laws
 from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
 from thermoctl.diagnosis.law.refit import law_of as placed_law
-from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect
+from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect, wrong_ends
 from thermoctl.diagnosis.law.signals import Place, Signal, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
@@ -283,6 +283,24 @@ def test_a_diode_is_an_exponential():
     (term,) = steep[0].terms
     own = law.hypothesis.effects[0].own
     assert abs(law.plant.parameters[own["s1"]].value * term.signals[0].size - 0.046) < 0.002
+
+
+def test_a_pump_that_feeds_another_vessel_than_the_plant_file_says_is_told():
+    pump = "inputs:\n  spare: {unit: V}\n"
+    text = TANKS.replace("inputs:\n", pump).replace(
+        "flows:\n", "flows:\n  fed: {into: upper, rate: 0.4 * spare}\n"
+    )
+    plant, t = loads(text), np.arange(0, 1200, 3.0)
+    fed = replace(plant.flows["fed"], target="lower", rate=ex.parse("0.4 * spare"))
+    truth = compile_plant(replace(plant, flows={**plant.flows, "fed": fed}))
+    on = {"pump": 1 + (np.sin(t / 90) > 0), "spare": 0.5 + (np.sin(t / 140) > 0.2)}
+    known = case(plant, [truth.measure(Table("run", "", t, on), 1)], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    led = [p for p in propose_laws(known, null, limits()) if p.place == Place("lower", "upper")]
+    led = [p for p in led if [(x.form.name, *x.variables) for x in p.terms] == [("linear", "spare")]]
+    law = SimpleNamespace(proposal=led[0], fitted=refitted_law(known, null, led[0], null))
+    (told,) = wrong_ends(known, law)
+    assert "flow 'fed' on to lower: it seems to end there, and not in upper" in told
 
 
 @pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, {"even", "even_power"})])

@@ -20,7 +20,7 @@ from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, spoken
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import PlacedLaw, equation, law_of
-from thermoctl.diagnosis.law.result import law_entry
+from thermoctl.diagnosis.law.result import law_entry, wrong_ends
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.search.beam import Searched, Weighed
@@ -206,6 +206,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
+        *(wrong_ends(d.case, d.law) if d.law else ()),
         *filter(None, [d.unknown]),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "

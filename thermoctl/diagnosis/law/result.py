@@ -7,14 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.held_out import Worth
+from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.propose import Proposal
-from thermoctl.diagnosis.law.refit import equation
+from thermoctl.diagnosis.law.refit import equation, law_rate
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
 from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.files.safe_file import make_folder, write_text
@@ -23,6 +26,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
 from thermoctl.report.page import BLUE, FAINT, GREY, panel, panels, table, unit
+
+SAME = 0.05  # largest difference of two flows that are taken for one, over their size
 
 
 def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
@@ -93,6 +98,27 @@ def family(law: FoundLaw) -> list[str]:
 def described(p: Proposal, f: Fitted) -> str:
     """Return a law as an expression with numbers, and its place."""
     return f"{equation(f, numbers=True)} at {p.place.where}"
+
+
+def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
+    """Return a sentence for a flow of the plant that the law only leads from its end to another node."""
+    place, model, fit = law.proposal.place, law.fitted.fit.model, law.fitted.fit
+    own, out = law_rate(law.fitted), []
+    for f in model.plant.flows.values():
+        if place.part != "flow" or not place.source or f.target != place.source:
+            continue
+        moved, whole = [], []
+        for d, values, dx0 in zip(case.drives(model), fit.values, fit.dx0, strict=True):
+            names = signals(model, d, values, model.run(d, values, dx0).x)
+            moved.append(ex.series(own, names, d.t))
+            whole.append(ex.series(f.rate, names, d.t))
+        apart = np.concatenate(moved) - np.concatenate(whole)
+        if np.linalg.norm(apart) < SAME * np.linalg.norm(np.concatenate(whole)):
+            out.append(
+                f"the law leads all of the flow '{f.name}' on to {place.target}: it seems to end there, and not in "
+                f"{place.source}, as the plant file says"
+            )
+    return out
 
 
 def law_section(law: FoundLaw | None, entry: Mapping[str, Any] | None) -> str:
