@@ -117,14 +117,19 @@ class ControlSettings:
         restart=True,
         choices=("torque", "velocity", "position"),
     )
-    kp: float = option("proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3)
-    ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6)
-    td_s: float = option("derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3)
+    kp: float = option(
+        "proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3, in_steps=True
+    )
+    ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6, in_steps=True)
+    td_s: float = option(
+        "derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3, in_steps=True
+    )
     output_limit: float = option(
         "largest absolute drive, in the amplifier's unit; with mode: position the largest absolute target, um",
         unit="1",
         low=0.0,
         high=1e6,
+        in_steps=True,
     )
     setpoint_rate_um_s: float = option(
         "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
@@ -132,11 +137,17 @@ class ControlSettings:
         "um/s",
         1e-3,
         1e6,
+        in_steps=True,
     )
     setpoint_low_um: float = option("smallest setpoint that is accepted", -1e6, "um", -1e6, 1e6)
     setpoint_high_um: float = option("largest setpoint that is accepted", 1e6, "um", -1e6, 1e6)
     moving_average: int = option(
-        "number of position readings that are averaged for the controller; 1: no averaging", 1, "1", 1, 64
+        "number of position readings that are averaged for the controller; 1: no averaging",
+        1,
+        "1",
+        1,
+        64,
+        in_steps=True,
     )
 
 
@@ -161,7 +172,7 @@ class CompensationSettings:
         "largest absolute compensation; a larger estimate is clipped", 50.0, "um", 0.0, 1e4
     )
     slew_um_s: float = option(
-        "largest rate of change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4
+        "largest rate of change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4, in_steps=True
     )
 
 
@@ -333,6 +344,11 @@ class Settings:
         """Return the settings of each axis; of a rig without axes its own."""
         return self.axes or (self,)
 
+    def value(self, key: str) -> Any:
+        """Return the value of an option, by section.key."""
+        section, name = key.split(".")
+        return getattr(getattr(self, section), name)
+
     def of_axis(self, name: str) -> Settings:
         """Return the settings of one axis. Raises InputError for an unknown name."""
         for part in self.axes:
@@ -377,23 +393,30 @@ def options() -> Iterator[tuple[str, dataclasses.Field[Any], Option]]:
 
 def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
     """List the options that differ, each with whether the change needs a restart."""
-    differing = []
-    for key, f, row in options():
-        section = key.split(".")[0]
-        before, after = (_plain(getattr(getattr(s, section), f.name)) for s in (old, new))
-        if before != after:
-            differing.append((key, row.restart))
+    differing = [
+        (key, row.restart) for key, _, row in options() if _plain(old.value(key)) != _plain(new.value(key))
+    ]
     if old.channels != new.channels:
         differing.append((POINTS, True))
     return differing
 
 
+def with_live(current: Settings, new: Settings) -> Settings:
+    """Return the current settings with the new values of all options that need no restart."""
+    live: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    for key, f, row in options():
+        if not row.restart:
+            live[key.split(".")[0]][f.name] = new.value(key)
+    sections = {s: dataclasses.replace(getattr(current, s), **values) for s, values in live.items()}
+    return dataclasses.replace(current, **sections)
+
+
 def effective(settings: Settings) -> str:
     """Write every option with the value in force, as YAML that `load_settings` reads (absolute paths)."""
     values: dict[str, dict[str, Any]] = {POINTS: settings.channels.plain()}
-    for key, f, _ in options():
+    for key, _, _ in options():
         section, name = key.split(".")
-        value = _plain(getattr(getattr(settings, section), f.name))
+        value = _plain(settings.value(key))
         if value is not None:
             values.setdefault(section, {})[name] = dict(value) if isinstance(value, Mapping) else value
     return yaml.safe_dump(values, sort_keys=False)

@@ -26,11 +26,14 @@ from thermoctl.control.model import Parameters
 from thermoctl.daemon.answers.display import fault_lines
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.control_socket import settled
+from thermoctl.daemon.reload import jumps
 from thermoctl.daemon.tick import arrival
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.daemon.tick.loop import RELOAD
 from thermoctl.daemon.tick.shared import TRIAL, Shared
 from thermoctl.files.yamlfile import InputError
+from thermoctl.rig.option import LIVE_STEP, TRIAL_FACTOR
+from thermoctl.rig.signals import AT
 from thermoctl_hal.rig.make import can_drive
 
 MAX_LINE = 65536  # bytes of one request
@@ -190,6 +193,23 @@ class Commands:
             self._apply(law_parameters(self.settings))
             self.shared.counters[TRIAL] = 0.0
 
+    def _refuse_jumps(self, new: Parameters) -> None:
+        """Raise InputError where these parameters would make the output of an armed rig jump."""
+        row = self.shared.ring.newest()
+        if row is None or row[AT["state"]] != arming.ARMED:
+            return
+        numbers = self.shared.parameters.get()
+        old = law_parameters(self.started) if numbers is None else Parameters.unpack(numbers)
+        found, drive = jumps(old, new), abs(row[AT["control_v"]])
+        if drive > new.output_limit:
+            found.append(f"control.output_limit {new.output_limit:g}, the drive is {drive:g} now")
+        if found:
+            raise InputError(
+                f"{self.settings.path}: nothing was changed, the output of the armed rig would jump: "
+                f"{'; '.join(found)}. While ARMED a reload changes each by a factor of {LIVE_STEP:g} at most: go in "
+                "steps, or disarm first"
+            )
+
     def _apply(self, parameters: Parameters) -> None:
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)
@@ -215,9 +235,14 @@ class Commands:
                     f"gains: {n}: a number from {low:g} to {high:g} was expected, found {value!r}"
                 )
             tried.append(float(value))
+        present = law_parameters(self.settings)
+        wanted = replace(present, kp=tried[0], ti_s=tried[1], td_s=tried[2])
+        if far := jumps(present, wanted, TRIAL_FACTOR):
+            raise InputError(
+                f"gains: {'; '.join(far)}: a trial changes each by a factor of {TRIAL_FACTOR:g} at most"
+            )
         self.shared.counters[TRIAL] = 1.0
-        control = replace(control, kp=tried[0], ti_s=tried[1], td_s=tried[2])
-        self._apply(law_parameters(replace(self.settings, control=control)))
+        self._apply(wanted)
         return {"ok": True, "generation": status(self.shared).get("generation")}
 
     def _disarm(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -245,6 +270,7 @@ class Commands:
 
     def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
+        self._refuse_jumps(parameters)
         self._apply(parameters)
         self.shared.counters[TRIAL] = 0.0
         self.settings = settings

@@ -7,6 +7,13 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+# Largest change of a gain at once while ARMED. It is less than the gain margin of 2 that `tune` proposes: a
+# stable loop stays stable.
+LIVE_STEP = 1.5
+# Largest change of a gain in one tuning. The recording was made with the present loop, whose motion hardly
+# reaches the frequencies at which a loop several times faster has its margins.
+TRIAL_FACTOR = 3.0
+
 
 @dataclass(frozen=True)
 class Option:
@@ -18,6 +25,7 @@ class Option:
     restart: bool
     meaning: str
     choices: tuple[str, ...] = ()
+    in_steps: bool = False
 
 
 def option(
@@ -29,11 +37,15 @@ def option(
     restart: bool = False,
     choices: tuple[str, ...] = (),
     factory: Any = dataclasses.MISSING,
+    in_steps: bool = False,
 ) -> Any:
-    """Return the dataclass field of one option; without default or factory the option must be given."""
+    """Return the dataclass field of one option; without default or factory the option must be given.
+
+    in_steps: a larger change than by a factor of LIVE_STEP would make an armed rig jump.
+    """
     return field(
         default=default,
         default_factory=factory,
         kw_only=True,
-        metadata={"option": Option(unit, low, high, restart, meaning, choices)},
+        metadata={"option": Option(unit, low, high, restart, meaning, choices, in_steps)},
     )
