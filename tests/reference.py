@@ -23,6 +23,7 @@ from thermoctl.configuration.settings import SECTIONS, options
 from thermoctl.configuration.which_rig import ACTS
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
+from thermoctl.daemon.reload import IN_STEPS
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.rig.channels import DEFAULT
 from thermoctl.rig.option import LIVE_STEP
@@ -87,7 +88,7 @@ def configuration() -> str:
                 o.unit,
                 ", ".join(o.choices) or _range(o.low, o.high),
                 _default(f),
-                "restart" if o.restart else "live, in steps" if o.in_steps else "live",
+                "restart" if o.restart else "live, in steps" if key in IN_STEPS else "live",
                 o.meaning,
             )
             for key, f, o in options()

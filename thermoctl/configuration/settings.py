@@ -117,19 +117,14 @@ class ControlSettings:
         restart=True,
         choices=("torque", "velocity", "position"),
     )
-    kp: float = option(
-        "proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3, in_steps=True
-    )
-    ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6, in_steps=True)
-    td_s: float = option(
-        "derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3, in_steps=True
-    )
+    kp: float = option("proportional gain: drive per um of position error", unit="1/um", low=0.0, high=1e3)
+    ti_s: float = option("integral time of the controller", unit="s", low=1e-5, high=1e6)
+    td_s: float = option("derivative time of the controller; 0 switches the term off", 0.0, "s", 0.0, 1e3)
     output_limit: float = option(
         "largest absolute drive, in the amplifier's unit; with mode: position the largest absolute target, um",
         unit="1",
         low=0.0,
         high=1e6,
-        in_steps=True,
     )
     setpoint_rate_um_s: float = option(
         "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
@@ -137,17 +132,11 @@ class ControlSettings:
         "um/s",
         1e-3,
         1e6,
-        in_steps=True,
     )
     setpoint_low_um: float = option("smallest setpoint that is accepted", -1e6, "um", -1e6, 1e6)
     setpoint_high_um: float = option("largest setpoint that is accepted", 1e6, "um", -1e6, 1e6)
     moving_average: int = option(
-        "number of position readings that are averaged for the controller; 1: no averaging",
-        1,
-        "1",
-        1,
-        64,
-        in_steps=True,
+        "number of position readings that are averaged for the controller; 1: no averaging", 1, "1", 1, 64
     )
 
 
@@ -172,7 +161,7 @@ class CompensationSettings:
         "largest absolute compensation; a larger estimate is clipped", 50.0, "um", 0.0, 1e4
     )
     slew_um_s: float = option(
-        "largest rate of change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4, in_steps=True
+        "largest rate of change of the compensation while armed", 1.0, "um/s", 1e-4, 1e4
     )
 
 

@@ -111,7 +111,7 @@ class Commands:
         try:
             answer = action(request)
         except InputError as e:
-            answer = {"ok": False, "error": str(e)}
+            answer = {"ok": False, "state": self._state(), "error": str(e)}
         self.log(
             "command",
             name=name,
@@ -152,22 +152,18 @@ class Commands:
 
     def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.can_drive:
-            return {
-                "ok": False,
-                "state": self._state(),
-                "error": "not armed: no device of hal.devices takes the command (a profile with 'drive'): "
-                "this rig measures, it cannot be driven",
-            }
+            raise InputError(
+                "not armed: no device of hal.devices takes the command (a profile with 'drive'): "
+                "this rig measures, it cannot be driven"
+            )
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)
         held = bool(request.get("held"))
         if self._state() == "ARMED" and held:
-            return {
-                "ok": False,
-                "state": "ARMED",
-                "error": "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that",
-            }
+            raise InputError(
+                "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that"
+            )
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
         if self._state() == "FAULT":
@@ -221,11 +217,10 @@ class Commands:
         if not set(names) & set(request):
             return {"ok": True, **{n: getattr(control, n) for n in names}}
         if not holds or self._state() != "ARMED":
-            return {
-                "ok": False,
-                "error": "gains not taken: they are tried only over the connection that armed the rig "
-                "(`thermoctl tune --write`); others are written into the file, then `thermoctl reload`",
-            }
+            raise InputError(
+                "gains not taken: they are tried only over the connection that armed the rig "
+                "(`thermoctl tune --write`); others are written into the file, then `thermoctl reload`"
+            )
         options = {f.name: f.metadata["option"] for f in fields(control)}
         tried = []
         for n in names:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from thermoctl.configuration.settings import Settings, changed, load_settings, options, with_live
+from thermoctl.configuration.settings import Settings, changed, load_settings, with_live
 from thermoctl.control.model import Parameters
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.rig.option import LIVE_STEP
 
+# Options of which a larger change would make the output of an armed rig jump.
+IN_STEPS = (
+    *(f"control.{n}" for n in ("kp", "ti_s", "td_s", "output_limit", "setpoint_rate_um_s", "moving_average")),
+    "compensation.slew_um_s",
+)
 ROUNDING = 1e-9  # a change by exactly the factor is no jump
 
 
@@ -26,12 +31,10 @@ def reload_settings(current: Settings, started: Settings) -> tuple[Any, Paramete
 
 
 def jumps(old: Parameters, new: Parameters, factor: float = LIVE_STEP) -> list[str]:
-    """List the changes by more than `factor` of options that an armed rig takes in steps."""
+    """List the changes of options IN_STEPS by more than `factor`."""
     found = []
-    for key, _, row in options():
-        if row.in_steps:
-            before, after = (getattr(p, key.split(".")[1]) for p in (old, new))
-            low, high = sorted((before, after))
-            if high > factor * low * (1.0 + ROUNDING):
-                found.append(f"{key} {before:g} -> {after:g}")
+    for key in IN_STEPS:
+        before, after = (getattr(p, key.split(".")[1]) for p in (old, new))
+        if max(before, after) > factor * min(before, after) * (1.0 + ROUNDING):
+            found.append(f"{key} {before:g} -> {after:g}")
     return found

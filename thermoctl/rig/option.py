@@ -25,7 +25,6 @@ class Option:
     restart: bool
     meaning: str
     choices: tuple[str, ...] = ()
-    in_steps: bool = False
 
 
 def option(
@@ -37,15 +36,11 @@ def option(
     restart: bool = False,
     choices: tuple[str, ...] = (),
     factory: Any = dataclasses.MISSING,
-    in_steps: bool = False,
 ) -> Any:
-    """Return the dataclass field of one option; without default or factory the option must be given.
-
-    in_steps: a larger change than by a factor of LIVE_STEP would make an armed rig jump.
-    """
+    """Return the dataclass field of one option; without default or factory the option must be given."""
     return field(
         default=default,
         default_factory=factory,
         kw_only=True,
-        metadata={"option": Option(unit, low, high, restart, meaning, choices, in_steps)},
+        metadata={"option": Option(unit, low, high, restart, meaning, choices)},
     )

@@ -111,7 +111,6 @@ class Link:
         self._free_s = 0.0  # time from which the next RTU frame may begin
         self._lost: set[tuple[int, int]] = set()  # unit and function of reads without an answer in time
         self._late: dict[int, _Echo] = {}  # by unit: function 8 was sent, its answer is waited for
-        self._echoing: set[int] = set()  # units that have answered function 8
         self._is_rtu = port.startswith("rtu:")
         messages, framers = (load(f"pymodbus.{name}", port) for name in ("pdu", "framer"))
         self._invalid = load("pymodbus", port).ModbusException
@@ -260,7 +259,7 @@ class Link:
     def _catch_up(self, request: _Request, timeout_s: float) -> None:
         """Send function 8 and wait for its answer; everything before that is late and dropped.
 
-        A unit that never answered function 8 is asked for registers again after ECHO_WAITS times of silence.
+        A unit is asked for registers again after ECHO_WAITS times without one: it may not know function 8.
         Raises NoAnswer, _Closed, OSError."""
         unit, end = request.unit, time.monotonic() + timeout_s
         time.sleep(max(0.0, self._free_s - time.monotonic()))
@@ -278,12 +277,11 @@ class Link:
         if unit not in self._late:
             return
         if echo.waits == ECHO_WAITS:
-            del self._late[unit]
-            if unit not in self._echoing:
-                self._forget_lost(unit)
+            self._caught_up(unit)
         raise NoAnswer(self._why(b"", request, timeout_s))
 
-    def _forget_lost(self, unit: int) -> None:
+    def _caught_up(self, unit: int) -> None:
+        del self._late[unit]
         self._lost = {key for key in self._lost if key[0] != unit}
 
     def _note_echoes(self, data: bytes) -> None:
@@ -291,9 +289,7 @@ class Link:
         for unit, echo in list(self._late.items()):
             echo.received += data
             if echo.is_answered(self._echoes):
-                del self._late[unit]
-                self._echoing.add(unit)
-                self._forget_lost(unit)
+                self._caught_up(unit)
 
     def _take(self) -> bytes:
         try:
