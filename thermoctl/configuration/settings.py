@@ -675,16 +675,19 @@ def _number(node: Node, label: str, row: Option, whole: bool = False) -> float:
     return int(value) if whole else value
 
 
+_WITH_UNIT = re.compile(r"\s*([-+]?[\d./]+(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")  # any blank, also U+00A0
+
+
 def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
-    """Convert text such as '5 ms' to the option's unit."""
-    number, _, given = text.strip().partition(" ")
+    """Convert text such as '5 ms' to the option's unit; a number alone has that unit."""
+    match = _WITH_UNIT.fullmatch(text)
     try:
-        value = Fraction(number)
+        value, given = Fraction(match[1] if match else text), match[2] if match else ""
     except (ValueError, ZeroDivisionError):
         said = decimal_comma(text) or f"a number in {unit or 'no unit'} was expected, not '{text}'"
         raise node.error(f"{label}: {said}") from None
     try:
-        if (factor := ratio(given, unit)) is not None:
+        if (factor := ratio(given, unit) if given else 1) is not None:
             return float(value * factor)
         scale, offset = conversion(given, unit or "1")
         return scale * float(value) + offset

@@ -287,7 +287,7 @@ class Link:
     def _note_echoes(self, data: bytes) -> None:
         """Notice answers to function 8, whichever unit is asked at present."""
         for unit, echo in list(self._late.items()):
-            echo.received += data
+            echo.received = (echo.received + data)[-CHUNK:]
             if echo.is_answered(self._echoes):
                 self._caught_up(unit)
 
