@@ -23,8 +23,10 @@ from thermoctl.configuration.settings import SECTIONS, options
 from thermoctl.configuration.which_rig import ACTS
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
+from thermoctl.daemon.reload import IN_STEPS
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.rig.channels import DEFAULT
+from thermoctl.rig.option import LIVE_STEP
 from thermoctl.rig.signals import FAULT_WORD_BITS, SIGNALS
 from thermoctl_hal.base.key import REQUIRED, Key
 from thermoctl_hal.profiles.keys import TABLES
@@ -76,7 +78,8 @@ def configuration() -> str:
     """Return the page of options: unit, range, default, whether a change needs a restart, meaning."""
     text = (
         _HEAD + "# Configuration\n\nOne YAML file describes a rig. `thermoctl check FILE` says whether it is "
-        "right; `thermoctl reload` applies the options that need no restart between two ticks.\n"
+        "right; `thermoctl reload` applies the options that need no restart between two ticks. In steps: while ARMED "
+        f"a reload changes it by a factor of {LIVE_STEP:g} at most, so that the output does not jump.\n"
     )
     for section, cls in SECTIONS.items():
         rows = [
@@ -85,7 +88,7 @@ def configuration() -> str:
                 o.unit,
                 ", ".join(o.choices) or _range(o.low, o.high),
                 _default(f),
-                "restart" if o.restart else "live",
+                "restart" if o.restart else "live, in steps" if key in IN_STEPS else "live",
                 o.meaning,
             )
             for key, f, o in options()

@@ -113,3 +113,21 @@ def test_a_written_value_may_bring_its_own_comment(tmp_path):
     assert path.read_text() == (
         "compensation:\n  model: models  # written by calibrate\n  bound_um: 30  # clipped\n"
     )
+
+
+@pytest.mark.parametrize(
+    "text", ["5 ms", "5\u00a0ms", "5ms", "5e-3 s", '"5 ms"', "0.005", '"0.005"', "5000 us", "1/200 s"]
+)
+def test_a_quantity_however_it_is_spaced(tmp_path, text):
+    """A no-break space from a manual was refused as 'a number in s was expected, not 5 ms'."""
+    assert loaded(tmp_path, "period_s: 1 ms", f"period_s: {text}").loop.period_s == pytest.approx(
+        0.005, rel=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["5 kg", "5 5 ms", "ms", "ms 5", "5,0 ms", "5 m s", "1e ms", "0x5 ms", "nan ms", "1/0 s"]
+)
+def test_no_quantity_is_guessed(tmp_path, text):
+    with pytest.raises(InputError, match="loop.period_s"):
+        loaded(tmp_path, "period_s: 1 ms", f"period_s: {text}")

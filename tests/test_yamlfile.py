@@ -104,3 +104,13 @@ def test_a_decimal_comma_elsewhere():
         "c": [1, 5],
         "d": {"e": 3, "4": 1},
     }
+
+
+@pytest.mark.parametrize(
+    "mark, says",
+    [("\t", "a tab is not allowed"), ("\u00a0", "U\\+00A0 is no blank"), ("\u200b", "U\\+200B is")],
+)
+def test_what_looks_like_a_blank_is_named_with_its_line(mark, says):
+    """Copied from a manual or a chat, it broke the file, and the message named the line after it."""
+    with pytest.raises(InputError, match=f"not valid YAML: .*{says}.*: line 2\\)"):
+        loads(f"control:\n  kp:{mark}0.01\n  ti_s: 0.004\n")

@@ -91,7 +91,7 @@ READING = (
     argument(
         "--missing",
         metavar="WORD,...",
-        help="further words or numbers that mean 'no value', such as -9999 or 'not ready'",
+        help="further words or numbers that mean 'no value', as in --missing=-9999,'not ready'",
     ),
     argument(
         "--decimal",

@@ -96,6 +96,64 @@ def test_reload_applies_whole_files_only(daemon):
     assert now["state"] == "ARMED" and now["ticks"] > before and now["setpoint_um"] == 3.0
 
 
+JUMPS = (
+    ("kp: 0.01", "kp: 1.0", "control.kp 0.01 -> 1"),
+    ("kp: 0.01", "kp: 0.001", "control.kp 0.01 -> 0.001"),
+    ("ti_s: 0.004", "ti_s: 0.0004", "control.ti_s 0.004 -> 0.0004"),
+    ("td_s: 0.001", "td_s: 0", "control.td_s 0.001 -> 0"),
+    ("output_limit: 1.5", "output_limit: 0.01", "control.output_limit 1.5 -> 0.01"),
+    ("moving_average: 4", "moving_average: 64", "control.moving_average 4 -> 64"),
+    (
+        "setpoint_rate_um_s: 1 mm/min",
+        "setpoint_rate_um_s: 1e6",
+        "control.setpoint_rate_um_s 16.6667 -> 1e+06",
+    ),
+    ("slew_um_s: 1\n", "slew_um_s: 1e4\n", "compensation.slew_um_s 1 -> 10000"),
+)
+
+
+def test_a_reload_moves_no_armed_output_by_a_jump(daemon):
+    """A gain 100 times larger drove the coil to its limit; now it is refused with the way to it."""
+    text = daemon.config.read_text()
+    daemon.ask("arm")
+    daemon.ask("setpoint", value=3.0)
+    wait(lambda: daemon.ask("status")["reference_um"] == 3.0, "the reference at 3 um")
+    for old, new, named in JUMPS:
+        assert old in text, old
+        daemon.config.write_text(text.replace(old, new, 1))
+        answer = daemon.ask("reload")
+        assert not answer["ok"] and named in answer["error"] and "disarm" in answer["error"], answer
+    now = daemon.ask("status")
+    assert now["state"] == "ARMED" and now["generation"] == 0 and abs(now["compensated_um"] - 3.0) < 0.5
+    daemon.ask("disarm")
+    daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.02"))
+    assert daemon.ask("reload")["applied"] == ["control.kp"]  # disarmed: nothing to jump
+
+
+@pytest.mark.parametrize(
+    "old, new, named",
+    [
+        ("control:", "control:\n  mode: position", "control.mode"),
+        ("rig: {name: simulated}", "rig: {name: simulated}\npoints: {coil: {role: coil}, POINTS}", "points"),
+    ],
+)
+def test_an_option_that_needs_a_restart_stays_out_of_the_running_law(daemon, old, new, named):
+    """The law took `mode: position` by a reload: the drive became the target in um, at its limit."""
+    text = daemon.config.read_text()
+    daemon.ask("arm")
+    daemon.ask("setpoint", value=3.0)
+    wait(lambda: daemon.ask("status")["reference_um"] == 3.0, "the reference at 3 um")
+    names = [name for name in daemon.settings.channels.point_names if name != "coil"]
+    points = ", ".join(f"{name}: {{}}" for name in (*names, "one_more"))
+    daemon.config.write_text(text.replace(old, new.replace("POINTS", points), 1))
+    answer = daemon.ask("reload")
+    assert not answer["ok"] or named in answer["needs_restart"], answer
+    ticks = daemon.ask("status")["ticks"]
+    wait(lambda: daemon.ask("status")["ticks"] > ticks + 300, "300 ticks more")
+    now = daemon.ask("status")
+    assert now["state"] == "ARMED" and abs(now["compensated_um"] - 3.0) < 0.5 and abs(now["drive"]) < 0.5
+
+
 def test_a_reload_that_takes_long_starves_no_watchdog(unrecorded, tmp_path, monkeypatch):
     """On a loaded machine the answer took longer than systemd's WatchdogSec, which then killed an armed rig."""
     heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

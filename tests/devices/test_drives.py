@@ -316,6 +316,56 @@ def test_an_amplifier_is_switched_off_over_a_link_of_its_own(made):
     thread.join()
 
 
+@pytest.fixture
+def can_drive(tmp_path):
+    """The drive by DBC messages, driving 1 Nm, and what puts frames on its bus."""
+    drive, wire, profile, port, report = dbc(tmp_path)
+    (tmp_path / "drive.yaml").write_text(profile)
+    with Rig(
+        tmp_path, f"- {{name: drive, profile: drive.yaml, port: '{port}', address: 3, roles: {ROLES}}}"
+    ) as rig:
+        tick = rig.tick
+        rig.tick = lambda: (report(), tick())
+        rig.enable, rig.drive = True, 0.5
+        rig.until(lambda: drive.output == pytest.approx(1.0), "enabled")
+        yield drive, wire, rig
+    wire.close()
+
+
+SECOND_MASTER = {
+    "the command": (3 << 5 | 14, False, struct.pack("<f", -2.0)),
+    "enabling": (3 << 5 | 7, False, struct.pack("<I", 9)),
+    "a reset": (3 << 5 | 24, False, b"\0"),
+}
+
+
+@pytest.mark.parametrize("what", SECOND_MASTER)
+def test_a_second_master_on_a_dbc_drive_stops_the_axis(can_drive, what):
+    drive, wire, rig = can_drive
+    wire.send(encode(SECOND_MASTER[what]))
+    rig.until(lambda: rig.status("amplifier_state") == "ERROR" and drive.output == 0.0, "stopped")
+    assert "two masters would drive one axis" in rig.backend.problem("amplifier_state")
+    rig.enable = False
+    rig.until(lambda: rig.status("amplifier_state") == "OK", "connected again, and not enabled by itself")
+    assert drive.output == 0.0
+
+
+def test_a_frame_to_another_drive_is_no_second_master(can_drive):
+    drive, wire, rig = can_drive
+    for _ in range(20):
+        wire.send(encode((4 << 5 | 14, False, struct.pack("<f", -2.0))))
+        rig.tick()
+    assert rig.status("amplifier_state") == "OK" and drive.output == pytest.approx(1.0)
+
+
+def test_an_adapter_that_hands_back_our_frames_is_no_second_master(can_drive):
+    drive, wire, rig = can_drive
+    adapter, sent = wire.take.__self__, []
+    adapter.nodes = (*adapter.nodes, lambda frame: [sent.append(frame) or frame])
+    rig.until(lambda: len(sent) > 50)
+    assert rig.status("amplifier_state") == "OK" and drive.output == pytest.approx(1.0)
+
+
 DAC = f"""{HEAD}bus: modbus
 modbus: {{timeout_s: 0.05}}
 drive: {{unit: V, scale: 0.005, limits: [0, 5], command_hz: 50, watchdog_s: none, state: assumed,

@@ -358,6 +358,7 @@ def test_an_eds_file_is_read_in_spite_of_what_is_not_named(tmp_path, odd, encodi
     "old,new",
     [
         ("=0x0006", '="0x0006"'), ("=0x0006", "=0x0006 # status"), ("=0x0006", "=0x0006;status"), ("=0x0006", "=UNSIGNED16"),
+        ("=0x0006", "=0X0006"), ("=0x0006", "=0x06h"), ("=0x0006", "=006 // status"),
         ("=0x0006", "=Unsigned16"), ("=0x0006", "=6"), ("DataType=", "DataType=\nDataType="), ("=", " = "), ("=", ": "),
         ("[6041]", "[6041h]"), ("[6041]", "[0x6041] ; status"), ("[6041]", "[ 6041"), ("\n", "\n\t"),
     ],
@@ -405,6 +406,42 @@ def test_what_a_drive_names_must_be_sound_in_its_eds(tmp_path, more, named, word
     with pytest.raises(InputError, match=words):
         make(tmp_path, HEAD + DRIVE % named, "virtual:x", "{state: amplifier_state}")
     assert make(tmp_path, HEAD + DRIVE % "", "virtual:x", "{state: amplifier_state}")
+
+
+LIMITS = {
+    "decimal": ("-1000", "+1000"), "a blank after the sign": ("- 1000", "1000"), "16 bits": ("0xFC18", "0X03E8"),
+    "32 bits for 16": ("0xFFFFFC18", "0x000003E8"), "with h": ("0FC18h", "3E8h"), "both marks": ("0xFC18h", "0x3E8"),
+    "a comment": ("-1000 // A", "1000 ; A"), "leading zeros": ("-1000", "0x0003E8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", LIMITS)
+def test_the_limits_of_an_eds_are_heeded_in_every_spelling(tmp_path, how):
+    """A limit that was not understood was none: the drive's refusal came in the tick, or never."""
+    low, high = LIMITS[how]
+    tmp_path.joinpath("a.eds").write_text(EDS + TORQUE + f"LowLimit={low}\nHighLimit={high}\n")
+    for reach, fits in (("[-1, 1]", True), ("[-1.1, 1]", False), ("[-1, 1.1]", False)):
+        profile = HEAD + DRIVE.replace("[-1, 1]", reach) % ""
+        if fits:
+            assert make(tmp_path, profile, "virtual:x", "{state: amplifier_state}")
+            continue
+        with pytest.raises(InputError, match=r"takes -1000 \.\. 1000 \(LowLimit, HighLimit\)"):
+            make(tmp_path, profile, "virtual:x", "{state: amplifier_state}")
+
+
+@pytest.mark.parametrize(
+    "limit, says",
+    [
+        ("-1000.5", "no decimal number"),
+        ("1 000", "no decimal number"),
+        ("01750", "could be octal, 1000"),
+        ("−5", "=−5"),
+    ],
+)
+def test_a_limit_that_is_no_number_is_not_passed_over(tmp_path, limit, says):
+    tmp_path.joinpath("a.eds").write_text(EDS + TORQUE + f"LowLimit={limit}\n")
+    with pytest.raises(InputError, match=f"0x6071 has LowLimit={limit}.*{says}|{says}.*correct the file"):
+        make(tmp_path, HEAD + DRIVE % "", "virtual:x", "{state: amplifier_state}")
 
 
 def test_an_eds_without_objects_is_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Interfaces of python-can as they tell bus-off: by a state, an error frame, or an error of their own."""
 
 import queue
+import time
 
 import can
 import pytest
@@ -142,3 +143,19 @@ def test_bus_off_at_sending_is_named_at_once(rig, way):
     port.send((1, b"c"))  # a full queue may empty itself
     assert port.bad == 1
     port.close()
+
+
+def test_own_frames_that_an_interface_hands_back_are_not_taken(monkeypatch):
+    """gs_usb does it for every frame: a CiA 402 drive then stopped for a second master, which was we."""
+    monkeypatch.setattr(can, "Bus", lambda channel, **more: Interface(channel, **more))
+    port = open_can("pcan:PCAN_USBBUS3@500000", (0x205,))
+    Interface.current.arriving.put(
+        can.Message(arbitration_id=0x205, data=b"a", is_extended_id=False, is_rx=False)
+    )
+    Interface.current.arriving.put(can.Message(arbitration_id=0x205, data=b"b", is_extended_id=False))
+    found = []
+    deadline = time.monotonic() + 10
+    while not found and time.monotonic() < deadline:
+        found = port.receive()
+    port.close()
+    assert found == [(0x205, b"b")]

@@ -318,7 +318,7 @@ class RtuLine:
             if not select.select([self.master], [], [], 0.05)[0]:
                 continue
             data += os.read(self.master, 256)
-            if len(data) >= 8 and modbus_crc(data[:6]) == data[6:8]:
+            while len(data) >= 8 and modbus_crc(data[:6]) == data[6:8]:
                 request, data = data[:8], data[8:]
                 function, address, count = struct.unpack(">BHH", request[1:6])
                 words = [REGISTERS[address + k] for k in range(count)] if function == 3 else []
@@ -357,6 +357,54 @@ def test_a_unit_that_is_always_late_gives_no_register_for_another(line, late_s):
             found.append((register, link.read("holding", register, 1, 1, 0.2)))
     assert [f for f in found if f[1] != [REGISTERS[f[0]]]] == []
     assert link.read("holding", 8, 1, 1, 1.0) == [888]  # with a time-out that is long enough
+
+
+def refuses_function_8(request, answer):
+    body = request[:1] + b"\x88\x01"
+    return body + modbus_crc(body) if request[1] == 8 else answer
+
+
+KNOWS_FUNCTION_8 = {"echoes": lambda request, answer: answer, "refuses": refuses_function_8}
+
+
+@pytest.mark.parametrize("spoil", KNOWS_FUNCTION_8.values(), ids=KNOWS_FUNCTION_8)
+@pytest.mark.parametrize("echo", [False, True])
+@pytest.mark.parametrize("late_s", [0.12, 0.25, 0.35])
+def test_an_answer_later_than_twice_the_timeout_is_no_other_register(line, spoil, echo, late_s):
+    """A unit that writes its memory answers once after 3.5 times `timeout_s`."""
+    delays = []
+
+    def late(request, answer):
+        time.sleep(delays.pop() if delays else 0.0)  # the unit's own slowness
+        return (request if echo else b"") + spoil(request, answer)
+
+    link, found = line(late), []
+    for _ in range(3):
+        delays.append(late_s)
+        for register in (0, 8, 100, 0, 8, 100, 8):
+            with contextlib.suppress(links.NoAnswer):
+                found.append((register, link.read("holding", register, 1, 1, 0.1)))
+    assert [f for f in found if f[1] != [REGISTERS[f[0]]]] == [] and len(found) >= 9
+
+
+def test_a_late_answer_is_remembered_while_other_units_are_asked(line):
+    """Unit 1 is late, unit 2 answers at once: unit 1's answer must not become that to its next register."""
+    delays = []
+
+    def late(request, answer):
+        if request[0] == 1:
+            time.sleep(delays.pop() if delays else 0.0)  # the unit's own slowness
+        return answer
+
+    link = line(late)
+    assert link.read("holding", 0, 1, 1, 0.1) == [2345]
+    delays.append(0.13)
+    with pytest.raises(links.NoAnswer):
+        link.read("holding", 0, 1, 1, 0.1)
+    with contextlib.suppress(links.NoAnswer):
+        link.read("holding", 8, 1, 2, 0.02)
+    with contextlib.suppress(links.NoAnswer):
+        assert link.read("holding", 8, 1, 1, 0.1) == [888]
 
 
 @pytest.mark.parametrize("zeros", [b"", b"\0", b"\0\0\0", b"\xff\0"])

@@ -13,7 +13,7 @@ from thermoctl.rig.signals import INDEX
 from thermoctl_hal.base.backend import ROLE
 from thermoctl_hal.simulated.faulty import Fault, FaultInjector
 
-TRIED = {"kp": 0.02, "ti_s": 0.008, "td_s": 0.0}
+TRIED = {"kp": 0.02, "ti_s": 0.008, "td_s": 0.0005}
 
 
 @pytest.fixture

@@ -156,6 +156,45 @@ def test_every_guess_is_said_aloud(tmp_path):
     assert read_recording(written(tmp_path, "t,x\n0,1\n")).notes == ()
 
 
+CODES = ("-127", "85", "-9999", "-9999.0", "6999", "7999", "1e37", "-999.9", "32767")
+
+
+@pytest.mark.parametrize("code", CODES)
+@pytest.mark.parametrize("sign", [",", ";"])
+def test_a_number_that_means_no_reading_is_named_and_kept(tmp_path, code, sign):
+    """A DS18B20 that lost contact logs -127, one that restarted 85.0: a diagnosis took both for heat."""
+    rows = [f"{k}{sign}{code if k in (3, 7) else 20 + 0.25 * k}{sign}{k % 2}" for k in range(20)]
+    path = written(tmp_path, "\n".join([sign.join(("t", "T", "heat")), *rows]) + "\n")
+    table = read_recording(path)
+    number = float(code)
+    assert (table.columns["T"] == number).sum() == 2
+    said = next(n for n in table.notes if "no reading" in n)
+    assert said.startswith(f"'T': {number:.10g} stands 2 times, the other readings are 20 to 24.75")
+    again = read_recording(path, missing=(said.rpartition("=")[2],))
+    assert np.isnan(again.columns["T"]).sum() == 2 and not any("no reading" in n for n in again.notes)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [20 + 5.0 * k for k in range(14)],  # it passes 85 on its way
+        [0, 0, 999, 999, 0, 999],  # on and off
+        [80.0, 81.5, 85.0, 85.0, 79.5],
+        [-9999.0] * 5,
+    ],
+)
+def test_a_reading_that_looks_like_a_code_is_no_suspect(tmp_path, values):
+    path = written(tmp_path, "\n".join(["t,T", *(f"{k},{v}" for k, v in enumerate(values))]) + "\n")
+    assert not any("no reading" in n for n in read_recording(path).notes)
+
+
+def test_two_codes_of_one_column_are_both_named(tmp_path):
+    values = [20.5, 21, -127, 22, 85, 20, -127, 21]
+    path = written(tmp_path, "\n".join(["t,T", *(f"{k},{v}" for k, v in enumerate(values))]) + "\n")
+    notes = [n for n in read_recording(path).notes if "no reading" in n]
+    assert [n.partition(",")[0] for n in notes] == ["'T': -127 stands 2 times", "'T': 85 stands 1 times"]
+
+
 def test_our_own_files_go_the_old_way(tmp_path, monkeypatch):
     from thermoctl.recording.foreign import logger
 

@@ -333,6 +333,11 @@ class Settings:
         """Return the settings of each axis; of a rig without axes its own."""
         return self.axes or (self,)
 
+    def value(self, key: str) -> Any:
+        """Return the value of an option, by section.key."""
+        section, name = key.split(".")
+        return getattr(getattr(self, section), name)
+
     def of_axis(self, name: str) -> Settings:
         """Return the settings of one axis. Raises InputError for an unknown name."""
         for part in self.axes:
@@ -377,23 +382,30 @@ def options() -> Iterator[tuple[str, dataclasses.Field[Any], Option]]:
 
 def changed(old: Settings, new: Settings) -> list[tuple[str, bool]]:
     """List the options that differ, each with whether the change needs a restart."""
-    differing = []
-    for key, f, row in options():
-        section = key.split(".")[0]
-        before, after = (_plain(getattr(getattr(s, section), f.name)) for s in (old, new))
-        if before != after:
-            differing.append((key, row.restart))
+    differing = [
+        (key, row.restart) for key, _, row in options() if _plain(old.value(key)) != _plain(new.value(key))
+    ]
     if old.channels != new.channels:
         differing.append((POINTS, True))
     return differing
 
 
+def with_live(current: Settings, new: Settings) -> Settings:
+    """Return the current settings with the new values of all options that need no restart."""
+    live: dict[str, dict[str, Any]] = {section: {} for section in SECTIONS}
+    for key, f, row in options():
+        if not row.restart:
+            live[key.split(".")[0]][f.name] = new.value(key)
+    sections = {s: dataclasses.replace(getattr(current, s), **values) for s, values in live.items()}
+    return dataclasses.replace(current, **sections)
+
+
 def effective(settings: Settings) -> str:
     """Write every option with the value in force, as YAML that `load_settings` reads (absolute paths)."""
     values: dict[str, dict[str, Any]] = {POINTS: settings.channels.plain()}
-    for key, f, _ in options():
+    for key, _, _ in options():
         section, name = key.split(".")
-        value = _plain(getattr(getattr(settings, section), f.name))
+        value = _plain(settings.value(key))
         if value is not None:
             values.setdefault(section, {})[name] = dict(value) if isinstance(value, Mapping) else value
     return yaml.safe_dump(values, sort_keys=False)
@@ -663,16 +675,19 @@ def _number(node: Node, label: str, row: Option, whole: bool = False) -> float:
     return int(value) if whole else value
 
 
+_WITH_UNIT = re.compile(r"\s*([-+]?[\d./]+(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")  # any blank, also U+00A0
+
+
 def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
-    """Convert text such as '5 ms' to the option's unit."""
-    number, _, given = text.strip().partition(" ")
+    """Convert text such as '5 ms' to the option's unit; a number alone has that unit."""
+    match = _WITH_UNIT.fullmatch(text)
     try:
-        value = Fraction(number)
+        value, given = Fraction(match[1] if match else text), match[2] if match else ""
     except (ValueError, ZeroDivisionError):
         said = decimal_comma(text) or f"a number in {unit or 'no unit'} was expected, not '{text}'"
         raise node.error(f"{label}: {said}") from None
     try:
-        if (factor := ratio(given, unit)) is not None:
+        if (factor := ratio(given, unit) if given else 1) is not None:
             return float(value * factor)
         scale, offset = conversion(given, unit or "1")
         return scale * float(value) + offset

@@ -101,10 +101,10 @@ ACTS = (
     ),
     Act(
         "reload",
-        "applies changed limits and gains between two ticks",
+        "applies changed limits and gains between two ticks; while ARMED no change that would move the output",
         _OWN,
         "its purpose",
-        "1 the file is not valid; 2 no daemon",
+        "1 refused, or the file is not valid; 2 no daemon",
     ),
     Act("tune", "moves the stage by short setpoint ramps", _MOVES, _THROUGH, _MOVED),
     Act("experiment", "moves the stage by a schedule of setpoints", _MOVES, _THROUGH, _MOVED),

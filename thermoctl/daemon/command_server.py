@@ -26,11 +26,14 @@ from thermoctl.control.model import Parameters
 from thermoctl.daemon.answers.display import fault_lines
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.control_socket import settled
+from thermoctl.daemon.reload import jumps
 from thermoctl.daemon.tick import arrival
 from thermoctl.daemon.tick.assemble import law_parameters
 from thermoctl.daemon.tick.loop import RELOAD
 from thermoctl.daemon.tick.shared import TRIAL, Shared
 from thermoctl.files.yamlfile import InputError
+from thermoctl.rig.option import LIVE_STEP, TRIAL_FACTOR
+from thermoctl.rig.signals import AT
 from thermoctl_hal.rig.make import can_drive
 
 MAX_LINE = 65536  # bytes of one request
@@ -108,7 +111,7 @@ class Commands:
         try:
             answer = action(request)
         except InputError as e:
-            answer = {"ok": False, "error": str(e)}
+            answer = {"ok": False, "state": self._state(), "error": str(e)}
         self.log(
             "command",
             name=name,
@@ -149,22 +152,18 @@ class Commands:
 
     def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
         if not self.can_drive:
-            return {
-                "ok": False,
-                "state": self._state(),
-                "error": "not armed: no device of hal.devices takes the command (a profile with 'drive'): "
-                "this rig measures, it cannot be driven",
-            }
+            raise InputError(
+                "not armed: no device of hal.devices takes the command (a profile with 'drive'): "
+                "this rig measures, it cannot be driven"
+            )
         deadline = time.monotonic() + ANSWER_S  # a loop that was just started warms up for 0.1 s
         while not settled(status(self.shared)) and time.monotonic() < deadline:
             time.sleep(0.005)
         held = bool(request.get("held"))
         if self._state() == "ARMED" and held:
-            return {
-                "ok": False,
-                "state": "ARMED",
-                "error": "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that",
-            }
+            raise InputError(
+                "not armed for this command: the rig is ARMED already and in use; `thermoctl disarm` ends that"
+            )
         if self._state() == "ARMED":
             return {"ok": True, "state": "ARMED", "setpoint_um": status(self.shared)["setpoint_um"]}
         if self._state() == "FAULT":
@@ -190,6 +189,23 @@ class Commands:
             self._apply(law_parameters(self.settings))
             self.shared.counters[TRIAL] = 0.0
 
+    def _refuse_jumps(self, new: Parameters) -> None:
+        """Raise InputError where these parameters would make the output of an armed rig jump."""
+        row = self.shared.ring.newest()
+        if row is None or row[AT["state"]] != arming.ARMED:
+            return
+        numbers = self.shared.parameters.get()
+        old = law_parameters(self.started) if numbers is None else Parameters.unpack(numbers)
+        found, drive = jumps(old, new), abs(row[AT["control_v"]])
+        if drive > new.output_limit:
+            found.append(f"control.output_limit {new.output_limit:g}, the drive is {drive:g} now")
+        if found:
+            raise InputError(
+                f"{self.settings.path}: nothing was changed, the output of the armed rig would jump: "
+                f"{'; '.join(found)}. While ARMED a reload changes each by a factor of {LIVE_STEP:g} at most: go in "
+                "steps, or disarm first"
+            )
+
     def _apply(self, parameters: Parameters) -> None:
         self.shared.parameters.put(parameters.pack())
         self._send(RELOAD)
@@ -201,11 +217,10 @@ class Commands:
         if not set(names) & set(request):
             return {"ok": True, **{n: getattr(control, n) for n in names}}
         if not holds or self._state() != "ARMED":
-            return {
-                "ok": False,
-                "error": "gains not taken: they are tried only over the connection that armed the rig "
-                "(`thermoctl tune --write`); others are written into the file, then `thermoctl reload`",
-            }
+            raise InputError(
+                "gains not taken: they are tried only over the connection that armed the rig "
+                "(`thermoctl tune --write`); others are written into the file, then `thermoctl reload`"
+            )
         options = {f.name: f.metadata["option"] for f in fields(control)}
         tried = []
         for n in names:
@@ -215,9 +230,14 @@ class Commands:
                     f"gains: {n}: a number from {low:g} to {high:g} was expected, found {value!r}"
                 )
             tried.append(float(value))
+        present = law_parameters(self.settings)
+        wanted = replace(present, kp=tried[0], ti_s=tried[1], td_s=tried[2])
+        if far := jumps(present, wanted, TRIAL_FACTOR):
+            raise InputError(
+                f"gains: {'; '.join(far)}: a trial changes each by a factor of {TRIAL_FACTOR:g} at most"
+            )
         self.shared.counters[TRIAL] = 1.0
-        control = replace(control, kp=tried[0], ti_s=tried[1], td_s=tried[2])
-        self._apply(law_parameters(replace(self.settings, control=control)))
+        self._apply(wanted)
         return {"ok": True, "generation": status(self.shared).get("generation")}
 
     def _disarm(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -245,6 +265,7 @@ class Commands:
 
     def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)
+        self._refuse_jumps(parameters)
         self._apply(parameters)
         self.shared.counters[TRIAL] = 0.0
         self.settings = settings

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from thermoctl.configuration.settings import Settings, changed, load_settings
+from thermoctl.configuration.settings import Settings, changed, load_settings, with_live
 from thermoctl.control.model import Parameters
 from thermoctl.daemon.tick.assemble import law_parameters
+from thermoctl.rig.option import LIVE_STEP
+
+# Options of which a larger change would make the output of an armed rig jump.
+IN_STEPS = (
+    *(f"control.{n}" for n in ("kp", "ti_s", "td_s", "output_limit", "setpoint_rate_um_s", "moving_average")),
+    "compensation.slew_um_s",
+)
+ROUNDING = 1e-9  # a change by exactly the factor is no jump
 
 
 def reload_settings(current: Settings, started: Settings) -> tuple[Any, Parameters, list[str], list[str]]:
@@ -15,7 +23,18 @@ def reload_settings(current: Settings, started: Settings) -> tuple[Any, Paramete
     current: the settings in force; started: those at the daemon's start. Raises InputError for an invalid
     file; then nothing is applied.
     """
-    settings = load_settings(current.path, current.axis)
-    applied = [key for key, restart in changed(current, settings) if not restart]
-    waiting = [key for key, restart in changed(started, settings) if restart]
+    given = load_settings(current.path, current.axis)
+    applied = [key for key, restart in changed(current, given) if not restart]
+    waiting = [key for key, restart in changed(started, given) if restart]
+    settings = with_live(current, given)
     return settings, law_parameters(settings), applied, waiting
+
+
+def jumps(old: Parameters, new: Parameters, factor: float = LIVE_STEP) -> list[str]:
+    """List the changes of options IN_STEPS by more than `factor`."""
+    found = []
+    for key in IN_STEPS:
+        before, after = (getattr(p, key.split(".")[1]) for p in (old, new))
+        if max(before, after) > factor * min(before, after) * (1.0 + ROUNDING):
+            found.append(f"{key} {before:g} -> {after:g}")
+    return found

@@ -19,6 +19,7 @@ import yaml
 
 MAX_BYTES = 4_000_000  # a larger file was not written by a person
 MAX_DEPTH = 60
+_UNSEEN = re.compile("[\t\u00a0\u2007\u200b\u202f\u2060\u3000]")
 MAX_NUMBER = 1e300  # squares of larger numbers overflow
 
 
@@ -134,13 +135,21 @@ def loads(text: str, file: str = "<text>") -> Node:
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         where = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else file
-        hint = "" if "\t" not in text else " (a tab is not allowed as indentation)"
-        raise InputError(f"{where}: not valid YAML: {e.problem or e.context}{hint}") from None
+        raise InputError(f"{where}: not valid YAML: {e.problem or e.context}{_unseen(text)}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as e:
         raise InputError(f"{file}: not valid YAML: {str(e).splitlines()[0]}") from None
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def _unseen(text: str) -> str:
+    """Name the first character of a broken file that looks like a blank and is none, with its line."""
+    found = _UNSEEN.search(text)
+    if found is None:
+        return ""
+    name = "tab is not allowed as indentation" if found[0] == "\t" else f"U+{ord(found[0]):04X} is no blank"
+    return f" (a {name}: line {text.count(chr(10), 0, found.start()) + 1})"
 
 
 def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) -> Node:

@@ -37,18 +37,15 @@ from scipy import optimize, signal
 
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
+from thermoctl.rig.option import LIVE_STEP, TRIAL_FACTOR
 
 # No gains are proposed when the phase near the crossover has a larger standard error. A smaller one counts as
 # dead time.
 UNCERTAIN_DEG = 40.0
 ANSWERS = 10.0  # least gain of the response over its standard error; a fit to noise alone reaches 5
 WANTED_DEG, WANTED_GAIN = 45.0, 2.0  # least phase margin and gain margin of a proposal
-# Largest change of a gain in one proposal. The recording was made with the present loop, whose motion hardly
-# reaches the frequencies at which a loop several times faster has its margins.
-FACTOR = 3.0
-# Largest change of a gain in one step on the rig. It is less than WANTED_GAIN: a loop that has just shown its
-# margins does not become unstable by one step.
-STEP = 1.5
+FACTOR = TRIAL_FACTOR  # largest change of a gain in one proposal
+STEP = LIVE_STEP  # largest change of a gain in one step on the rig
 TURNS = 3.0  # a loop's phase passes 180 deg at about this multiple of its crossover
 SHORTEST_S = 1e-6  # lag that stands for no lag
 BLOCK_S = 1.0  # length of a block of residuals; the blocks count as independent

@@ -7,6 +7,13 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+# Largest change of a gain at once while ARMED. It is less than the gain margin of 2 that `tune` proposes: a
+# stable loop stays stable.
+LIVE_STEP = 1.5
+# Largest change of a gain in one tuning. The recording was made with the present loop, whose motion hardly
+# reaches the frequencies at which a loop several times faster has its margins.
+TRIAL_FACTOR = 3.0
+
 
 @dataclass(frozen=True)
 class Option:

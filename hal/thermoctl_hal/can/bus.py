@@ -130,9 +130,11 @@ class LibraryPort(CanPort):
         self._bus: Any
         self._is_fd = bool(data_bitrate)
         self._has_kernel_errors = interface in KERNEL_ERRORS
-        fd: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if data_bitrate else {}
+        more: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if data_bitrate else {}
+        if interface == "socketcan":
+            more["receive_own_messages"] = False  # also where ~/.canrc sets it
         try:
-            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel, **fd)
+            self._bus = can.Bus(channel, interface=interface, bitrate=bitrate, can_filters=in_kernel, **more)
         except (can.CanError, OSError, ValueError, ImportError) as e:
             raise HardwareError(
                 f"{interface}:{channel}: cannot be opened ({e}); is the interface up (ip link set "
@@ -237,6 +239,8 @@ class LibraryPort(CanPort):
             if message.arbitration_id & _BUS_OFF and self._has_kernel_errors:
                 raise HardwareError(BUS_OFF)
             self._check_state()
+        elif not message.is_rx:
+            pass  # gs_usb and others hand back what we sent
         elif message.is_remote_frame:
             self.ignored += 1
         elif self._wanted is None or is_wanted(can_id, self._wanted):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import lru_cache
@@ -13,7 +14,7 @@ from thermoctl_hal.base.backend import HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.message import can_frame
-from thermoctl_hal.base.profile import Assumed, Dbc, DbcSource, Message, typed
+from thermoctl_hal.base.profile import Amplifier, Assumed, CanMessage, Dbc, DbcSource, Message, typed
 from thermoctl_hal.base.wire import EXTENDED
 from thermoctl_hal.can.bus import BY_PGN, AnyPort, open_can, pgn_of
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:  # loading cantools takes a second
 
 _Entry = tuple["DbcMessage", list[tuple[int, DbcSource]], list[str]]
 CLASSIC_BYTES = 8  # longest data of a frame that is not CAN FD
+ECHOES = 64  # own frames that may still come back from an adapter
 
 
 class DbcDevice(Device):
@@ -39,6 +41,7 @@ class DbcDevice(Device):
         self._others: set[int] = set()  # source addresses of J1939 whose messages were not taken
         # Number of frames since the last reading; why the newest of them gave no reading.
         self._quiet, self._why = 0, ""
+        self._commands: dict[int, str] = {}  # CAN id -> message of ours, that nobody else may send
         for i, b in enumerate(binding.bounds):
             if isinstance(b.channel.source, Assumed):
                 continue
@@ -68,7 +71,7 @@ class DbcDevice(Device):
 
     def connect(self) -> None:
         """Open the port."""
-        self._port = open_can(self.binding.port, tuple(self._messages), self.binding.shared)
+        self._port = open_can(self.binding.port, (*self._messages, *self._commands), self.binding.shared)
         self._quiet = 0
 
     def disconnect(self) -> None:
@@ -86,7 +89,8 @@ class DbcDevice(Device):
             self._take(sample, can_id, data, now_s)
         for can_id, data in port.long_frames():
             entry = self._entry(can_id)
-            if entry is not None and (entry[0].is_fd or entry[0].length > CLASSIC_BYTES):
+            is_long = entry is not None and (entry[0].is_fd or entry[0].length > CLASSIC_BYTES)
+            if is_long or can_id in self._commands:
                 self._take(sample, can_id, data, now_s)
             else:
                 self._fd_ignored += 1
@@ -215,13 +219,39 @@ def _shown(can_id: int) -> str:
 
 
 class DbcDrive(Commanded, DbcDevice):
-    """An amplifier that takes messages of a DBC file."""
+    """An amplifier that takes messages of a DBC file.
+
+    A frame with the identifier of a message of ours is another master's, unless it is the echo of one that
+    we sent. A message of which a channel is bound comes from the amplifier, too, and is not checked.
+    """
+
+    def __init__(self, binding: Binding) -> None:
+        super().__init__(binding)
+        a = typed(binding.profile.amplifier, Amplifier)
+        names = {typed(m, CanMessage).name for m in (a.command, *a.set_up, *a.enable, *a.disable, *a.reset)}
+        ids = {self._spec.can_id(name, binding.address): name for name in names}
+        self._commands = {i: n for i, n in ids.items() if not {i, pgn_of(i)} & self._messages.keys()}
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=ECHOES)
+
+    def _take(self, sample: Sample, can_id: int, data: bytes, now_s: float) -> None:
+        """Store the readings of a frame. Raises HardwareError for a command of another master."""
+        if can_id not in self._commands:
+            super()._take(sample, can_id, data, now_s)
+        elif (can_id, data) in self._sent:
+            self._sent.remove((can_id, data))
+        else:
+            raise HardwareError(
+                f"another device on {self.binding.port} sends {self._commands[can_id]}, {_shown(can_id)}, which "
+                "commands this drive: two masters would drive one axis; switch the other one off. If the drive itself "
+                "answers with this message, bind a channel of it"
+            )
 
     def send_message(self, message: Message, command: float) -> None:
         """Send one message. Raises OSError."""
         if self._port is None:
             raise HardwareError("not connected")
         can_id, data = can_frame(message, self._spec, command, self.binding.address)
+        self._sent.append((can_id, data))
         if len(data) > CLASSIC_BYTES:
             self._port.send_long(can_id, data)
         else:

@@ -17,7 +17,7 @@ from thermoctl_hal.base.text_file import read_text, while_same
 
 _SECTION = re.compile(r"\s*\[\s*([^\];]*?)\s*(?:\]|$|;)")  # the second bracket may be missing
 _OBJECT = re.compile(r"(?:0x)?([0-9A-F]{4})h?(?:\s*sub\s*(?:0x)?([0-9A-F]{1,2})h?)?", re.IGNORECASE)
-_NUMBER = re.compile(r"(?:0x([0-9A-F]+)|([0-9A-F]+)h|(\d+))", re.IGNORECASE)
+_NUMBER = re.compile(r"([+-]?)\s*(?:0x([0-9A-F]+)h?|([0-9A-F]+)h|(\d+))", re.IGNORECASE)
 _COMMENT = (";", "#", "//")
 _NAMES = ("boolean", "integer8", "integer16", "integer32", "unsigned8", "unsigned16", "unsigned32", "real32")
 """Data types of CiA 301 from number 1 on, by name."""
@@ -51,18 +51,29 @@ class Entry:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Return LowLimit and HighLimit; without bounds where they are not stated or leave no range."""
-        low, high = (self._limit(key) for key in ("lowlimit", "highlimit"))
+        """Return LowLimit and HighLimit; without bounds where they are not stated or leave no range.
+
+        Raises ValueError for a limit that is no number: it must not be passed over."""
+        low, high = (self._limit(key) for key in ("LowLimit", "HighLimit"))
         bounds = -math.inf if low is None else low, math.inf if high is None else high
         return bounds if bounds[0] < bounds[1] else (-math.inf, math.inf)
 
     def _limit(self, key: str) -> int | None:
-        """Return a limit; a hexadecimal one of a signed type is a two's complement."""
-        text = _plain(self.keys.get(key, ""))
-        value, bits = _number(text.removeprefix("-")), {2: 8, 3: 16, 4: 32}.get(self.data_type or 0)
-        if value is None or text.startswith("-"):
-            return None if value is None else -value
-        return value - (1 << bits) if bits and 1 << (bits - 1) <= value < 1 << bits else value
+        """Return a limit; a hexadecimal one of a signed type is a two's complement, also of 32 bits."""
+        text = _plain(self.keys.get(key.lower(), ""))
+        if not text or "$NODEID" in text.upper():
+            return None
+        value, bits = _number(text), {2: 8, 3: 16, 4: 32}.get(self.data_type or 0, 0)
+        octal = re.fullmatch(r"[+-]?0+([1-7][0-7]+)", text)
+        if value is None or octal:
+            either = f" (it could be octal, {int(octal[1], 8)})" if octal else ""
+            raise ValueError(
+                f"{key}={text}, which is no decimal number and no 0x..{either}: correct the file"
+            )
+        for width in (bits, 32) if bits else ():
+            if -(1 << (bits - 1)) <= value - (1 << width) < 0:
+                return value - (1 << width)
+        return value
 
 
 @dataclass(frozen=True)
@@ -83,15 +94,16 @@ class Eds:
 
 def _plain(text: str) -> str:
     """Return a value without its comment, blanks and quotes."""
-    return re.split("[;#]", text)[0].strip().strip("'\"")
+    return re.split("[;#]|//", text)[0].strip().strip("'\"")
 
 
 def _number(text: str) -> int | None:
-    """Return a number as EDS files write it: 7, 0x0007, 0007h; None for other text."""
+    """Return a number as EDS files write it: 7, -7, 0x0007, 0007h; None for other text."""
     match = _NUMBER.fullmatch(_plain(text))
     if match is None:
         return None
-    return int(match[1] or match[2] or match[3], 10 if match[3] else 16)
+    value = int(match[2] or match[3] or match[4], 10 if match[4] else 16)
+    return -value if match[1] == "-" else value
 
 
 @while_same

@@ -104,7 +104,10 @@ class Objects:
         """Raise InputError where values from low to high are outside the limits of the object's EDS file."""
         if self.eds is None or item not in self._file.entries:
             return
-        least, most = self._file.entries[item].limits
+        try:
+            least, most = self._file.entries[item].limits
+        except ValueError as e:
+            raise self._error(item, key, f"has {e}") from None
         if low < least or high > most:
             given = f"{low:g}" if low == high else f"{low:g} .. {high:g}"
             what = f"takes {least:.12g} .. {most:.12g} (LowLimit, HighLimit), {given} is outside"

@@ -10,10 +10,10 @@ Messages and frames are pymodbus'; no other module uses it. Its client gives up 
 send beside an answer, so connections are ours.
 
 Bytes that arrived before a request, such as a late answer, are dropped. An answer on a serial line does not
-name its register. So a late one is waited for before another register of the unit is asked. A server that
-closes the connection after an answer is connected again for the next request. One that is silent after
-connecting gets more time at each connection. On a serial line the echo of the request and bytes before the
-answer are passed over.
+name its register. So after a lost answer a unit is asked for an echo (function 8) first. Units answer in
+order: everything before the echo is late. A server that closes the connection after an answer is connected
+again for the next request. One that is silent after connecting gets more time at each connection. On a serial
+line the echo of the request and bytes before the answer are passed over.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ from typing import Any
 
 from thermoctl.extras import load
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.base.line import NETWORK, QUIET_S, open_port
+from thermoctl_hal.base.line import NETWORK, open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
 
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """Modbus function code that reads a kind."""
 BITS = ("coil", "discrete")
-WRITE_COIL, WRITE_SEVERAL = 5, 16
+WRITE_COIL, ECHO, WRITE_SEVERAL = 5, 8, 16  # ECHO: Return Query Data
+ECHO_WAITS = 3  # time-outs in which the answer to ECHO is waited for
 REFUSAL = 0x80  # bit of the function code of an exception
+EXCEPTION_CODES = range(1, 12)
 # Bytes of the shortest RTU frame; number of bytes of a bad answer that a message shows.
 MIN_RTU, SHOWN = 4, 12
 HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
@@ -74,6 +76,29 @@ class _Request:
         return self.pdu[0]
 
 
+@dataclass
+class _Echo:
+    """Requests by function 8 to a unit, and all bytes that came since the first."""
+
+    unit: int
+    waits: int = 0
+    frame: bytes = b""
+    received: bytes = b""
+
+    def next_frame(self, number: int) -> bytes:
+        """Return the next request; its number distinguishes the answers."""
+        self.frame = _with_crc(struct.pack(">BBHH", self.unit, ECHO, 0, number))
+        return self.frame
+
+    def is_answered(self, line_echoes: bool) -> bool:
+        """Return whether the newest request was answered by the same frame, or one by an exception.
+
+        line_echoes: the adapter sends our own bytes back, too."""
+        exceptions = (_with_crc(bytes((self.unit, ECHO | REFUSAL, code))) for code in EXCEPTION_CODES)
+        is_refused = any(e in self.received for e in exceptions)
+        return is_refused or self.received.count(self.frame) > line_echoes
+
+
 class Link:
     """An open port. `users` counts its devices; `broken`: to be opened again."""
 
@@ -84,7 +109,8 @@ class Link:
         self._echoes = False  # does the line send our own bytes back?
         self._answered = False
         self._free_s = 0.0  # time from which the next RTU frame may begin
-        self._lost: _Request | None = None  # the last request, if it was not answered in time
+        self._lost: set[tuple[int, int]] = set()  # unit and function of reads without an answer in time
+        self._late: dict[int, _Echo] = {}  # by unit: function 8 was sent, its answer is waited for
         self._is_rtu = port.startswith("rtu:")
         messages, framers = (load(f"pymodbus.{name}", port) for name in ("pdu", "framer"))
         self._invalid = load("pymodbus", port).ModbusException
@@ -194,9 +220,9 @@ class Link:
     def _ask_once(self, message: Any, timeout_s: float) -> bytes:
         """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
         request = self._framed(message)
-        if self._is_rtu and self._lost is not None and _may_answer(self._lost, request):
-            self._drop_late(timeout_s)
-        self._lost = request
+        key = request.unit, request.function
+        if key in self._lost:
+            self._catch_up(request, timeout_s)
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self._drop()
         end = time.monotonic() + timeout_s
@@ -208,10 +234,11 @@ class Link:
             received += self._take()
             answer = self._found_rtu(received, request) if self._is_rtu else _found_tcp(received, request)
             if answer is not None:
-                self._lost = None
                 self._rest()
                 return answer
         self._rest()
+        if self._is_rtu and request.function in FUNCTIONS.values():
+            self._lost.add(key)
         raise NoAnswer(self._why(received, request, timeout_s))
 
     def _rest(self) -> None:
@@ -229,12 +256,40 @@ class Link:
         while select.select([self._line], [], [], 0.0)[0]:
             self._take()
 
-    def _drop_late(self, timeout_s: float) -> None:
-        """Drop the late answer to another request. Raises _Closed, OSError."""
-        end, left = time.monotonic() + timeout_s, timeout_s
-        while left > 0.0 and select.select([self._line], [], [], left)[0]:
-            self._take()
-            left = min(QUIET_S, end - time.monotonic())
+    def _catch_up(self, request: _Request, timeout_s: float) -> None:
+        """Send function 8 and wait for its answer; everything before that is late and dropped.
+
+        A unit is asked for registers again after ECHO_WAITS times without one: it may not know function 8.
+        Raises NoAnswer, _Closed, OSError."""
+        unit, end = request.unit, time.monotonic() + timeout_s
+        time.sleep(max(0.0, self._free_s - time.monotonic()))
+        self._drop()
+        if (unit, request.function) not in self._lost:
+            return
+        echo = self._late.setdefault(unit, _Echo(unit))
+        echo.waits += 1
+        if self._found_rtu(echo.received, request) is None:  # else it is at work, and slow
+            self._send(echo.next_frame(request.transaction), end)
+        while unit in self._late and (left := end - time.monotonic()) > 0.0:
+            if select.select([self._line], [], [], left)[0]:
+                self._take()
+        self._rest()
+        if unit not in self._late:
+            return
+        if echo.waits == ECHO_WAITS:
+            self._caught_up(unit)
+        raise NoAnswer(self._why(b"", request, timeout_s))
+
+    def _caught_up(self, unit: int) -> None:
+        del self._late[unit]
+        self._lost = {key for key in self._lost if key[0] != unit}
+
+    def _note_echoes(self, data: bytes) -> None:
+        """Notice answers to function 8, whichever unit is asked at present."""
+        for unit, echo in list(self._late.items()):
+            echo.received = (echo.received + data)[-CHUNK:]
+            if echo.is_answered(self._echoes):
+                self._caught_up(unit)
 
     def _take(self) -> bytes:
         try:
@@ -243,6 +298,7 @@ class Link:
             return b""
         if not data:
             raise _Closed
+        self._note_echoes(data)
         return data
 
     def _send(self, data: bytes, end_s: float) -> None:
@@ -321,9 +377,8 @@ def _rtu_size(data: bytes, request: _Request) -> int:
     return 8 if request.function in (WRITE_COIL, 6, WRITE_SEVERAL) else 5 + data[2]
 
 
-def _may_answer(lost: _Request, request: _Request) -> bool:
-    """Return whether the answer to a request looks as one to another: RTU repeats no register."""
-    return (lost.unit, lost.function) == (request.unit, request.function) and lost.pdu != request.pdu
+def _with_crc(body: bytes) -> bytes:
+    return body + checksum("modbus", body).to_bytes(2, "little")
 
 
 def _has_good_crc(frame: bytes) -> bool:

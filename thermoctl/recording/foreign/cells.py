@@ -20,6 +20,12 @@ MISSING = frozenset({"", *(w.strip() for w in WORDS["missing"].split("|"))})
 _MARKS = r"^(?:[-+*?.=_~–—∞]+|[-+]?\d\.#\w+)$"
 """Cells of marks only, as loggers write them out of range, and NaN as Windows prints it, such as -1.#J."""
 _NO_READING = 9.9e37  # devices with SCPI send this and larger numbers for "overload" and "no value"
+_CODES = re.compile(
+    r"-99|-?9{3,}|-?99+\.9+|-?[67]999|85|-127|32767|-32768|65535|327\.67|-327\.68|3276\.7|-3276\.8|655\.35|6553\.5"
+)
+"""Numbers that sensors and loggers write without a reading: 85 and -127 are those of a DS18B20."""
+_FAR = 2.0  # a code is further from the other readings than this many times their range
+_HUGE = 1e9  # larger numbers are codes, such as 1e37, if the others are small
 PAIRS = tuple(tuple(pair.split("/")) for pair in WORDS["pairs"].split())
 """Words of two-valued columns: the first of a pair is 1, the second 0."""
 _GROUP = " '’_\u00a0\u2009\u202f"
@@ -78,6 +84,31 @@ def readings(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     none = (np.abs(values) >= _NO_READING) & np.isfinite(values)
     notes.append(f"'{name}': {int(none.sum())} numbers of 9.9e37 and more read as no value")
     return np.where(none, np.nan, values)
+
+
+def _is_code(value: float) -> bool:
+    return abs(value) >= _HUGE or _CODES.fullmatch(f"{value:.10g}") is not None
+
+
+def suspected_codes(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Return a note for each number that may mean "no value".
+
+    Such a number is far from the other readings of its column. It stays in the column."""
+    notes = []
+    for name, values in columns.items():
+        rest, found = values[np.isfinite(values)], list[float]()
+        while len(rest) and (code := next(filter(_is_code, (rest.min(), rest.max())), None)) is not None:
+            found.append(float(code))
+            rest = rest[rest != code]
+        low, high = (rest.min(), rest.max()) if len(rest) else (0.0, 0.0)
+        for code in found:
+            if 0.0 < _FAR * (high - low) < max(low - code, code - high):
+                said = f"{code:.10g}" if float(f"{code:.10g}") == code else repr(code)
+                notes.append(
+                    f"'{name}': {said} stands {int((values == code).sum())} times, the other readings are {low:g} to "
+                    f"{high:g}: if it means 'no reading', give --missing={said}"
+                )
+    return notes
 
 
 def _tidy_one(cell: str) -> str:

@@ -25,7 +25,7 @@ import pyarrow.parquet
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
-from thermoctl.recording.foreign.cells import has_no_readings
+from thermoctl.recording.foreign.cells import has_no_readings, suspected_codes
 from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
@@ -146,6 +146,7 @@ def _plain(path: Path) -> bool:
 
 
 def _renamed(table: Table, columns: Mapping[str, str]) -> Table:
+    table = replace(table, notes=(*table.notes, *suspected_codes(table.columns)))
     if not columns:
         return table
     chosen: dict[str, str] = {}
