@@ -7,6 +7,7 @@ import pytest
 
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, Case, case
+from thermoctl.diagnosis.data.memory import Memory
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.plant import load
@@ -43,6 +44,18 @@ def test_inputs_go_on_as_the_plant_alone_follows_them_better(between_rows, tmp_p
     known = taken(ONE_BLOCK, between_rows, tmp_path)
     assert known.plant.inputs["heat"].linear == between_rows
     assert any("straight lines between the rows of 'heat'" in note for note in known.notes) == between_rows
+
+
+def test_a_diagnosis_that_goes_on_reads_inputs_as_before(tmp_path):
+    """The sums of the earlier recordings hold one reading of them."""
+    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
+    for straight in ((), ("heat",)):
+        past = Memory((), ("run_0",), straight)
+        known = between(
+            load(tmp_path / "plant.yaml"),
+            lambda p, past=past: case(p, [recording(True, 1)], catalogue(), Budget(80), past),
+        )
+        assert known.plant.inputs["heat"].linear == bool(straight)
 
 
 def test_what_the_plant_file_states_is_not_asked(tmp_path):

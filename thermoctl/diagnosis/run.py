@@ -135,7 +135,8 @@ def _remembered(diagnosis: Diagnosis) -> memory.Memory:
         if k < memory.KEPT or not w.fitted.hypothesis.effects
     ]
     names = (*diagnosis.case.memory.recordings, *(t.name for t in diagnosis.case.tables))
-    return memory.Memory(tuple(remembered(diagnosis.case, f) for f in kept), names)
+    straight = tuple(i.name for i in diagnosis.case.plant.inputs.values() if i.linear and not i.stated)
+    return memory.Memory(tuple(remembered(diagnosis.case, f) for f in kept), names, straight)
 
 
 def diagnose_files(

@@ -64,10 +64,13 @@ class Past:
 
 @dataclass(frozen=True)
 class Memory:
-    """All remembered hypotheses, and the names of the recordings that they were fitted to."""
+    """All remembered hypotheses, and the names of the recordings that they were fitted to.
+
+    `straight`: inputs that were read on straight lines, though the plant file does not say so"""
 
     hypotheses: tuple[Past, ...] = ()
     recordings: tuple[str, ...] = ()
+    straight: tuple[str, ...] = ()
 
     def of(self, keys: Keys, plant: Plant) -> Past:
         """Return the posterior of a hypothesis, else of the largest, then likeliest, one that it contains."""
@@ -97,6 +100,7 @@ def write(folder: Path, plant: Plant, memory: Memory) -> None:
         "format": FORMAT,
         "plant": stated(plant),
         "recordings": list(memory.recordings),
+        "straight": list(memory.straight),
         "hypotheses": [
             {
                 **vars(h),
@@ -125,7 +129,8 @@ def read(folder: Path, plant: Plant) -> Memory:
     try:
         content = json.loads(path.read_text())
         old_plant = content["plant"]
-        memory = Memory(tuple(_past(h) for h in content["hypotheses"]), tuple(content["recordings"]))
+        past, straight = tuple(_past(h) for h in content["hypotheses"]), tuple(content.get("straight", ()))
+        memory = Memory(past, tuple(content["recordings"]), straight)
     except OSError:
         raise InputError(
             f"{path}: no such file; the folder of an earlier diagnosis (its --out) was expected (--continue)"

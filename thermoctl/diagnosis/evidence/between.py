@@ -26,14 +26,17 @@ CLEARLY = 15.0
 def between(plant: Plant, made: Callable[[Plant], Case]) -> Case:
     """Return the case of a plant, or that with straight inputs, if the plant alone fits clearly better so.
 
-    `made`: makes the case of a plant. Inputs whose file states how they go on are left alone. Raises
-    InputError."""
+    `made`: makes the case of a plant. Inputs whose file states how they go on are left alone. A diagnosis
+    that goes on reads them as it did before. Raises InputError."""
     case = made(plant)
-    moving = case.rig(case.plant, case.drives(case.null.model)).moving_inputs
-    loose = [i for i in driving_inputs(plant) if i.name in moving and not (i.linear or i.stated)]
-    if not loose or case.memory.recordings:
+    past, moving = case.memory, case.rig(case.plant, case.drives(case.null.model)).moving_inputs
+    asked = past.straight if past.recordings else moving
+    loose = [i for i in driving_inputs(plant) if i.name in asked and not (i.linear or i.stated)]
+    if not loose:
         return case
     inputs = {**plant.inputs} | {i.name: dataclasses.replace(i, linear=True) for i in loose}
+    if past.recordings:
+        return made(dataclasses.replace(plant, inputs=inputs))
     straight = dataclasses.replace(case.plant, inputs=inputs)
     model = compile_plant(straight)
     try:
