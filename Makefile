@@ -30,10 +30,13 @@ bench-law: develop                 # cost of a call of the law, by compiler
 	$(call listed,p['project']['optional-dependencies']['bench']) > $(VENV)/needs && $(PIP) --requirement $(VENV)/needs
 	$(BIN)/python tests/bench/law_call.py
 
+# Tests that only compute share two cores; then those that run in real time have both to themselves.
+COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs truth)
 # Property tests repeat the same examples (Hypothesis profile ci): a clean checkout that passes, passes again.
 EXAMPLES ?= ci
 test: develop lint                 # lint and all quick tests; EXAMPLES=default draws new examples of the properties
-	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) -n 2 --dist loadfile tests
+	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) -n 2 $(COMPUTED)
+	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) $(addprefix --ignore=,$(COMPUTED)) tests
 
 PROOF ?= build/proof
 SEED ?= 7
