@@ -133,9 +133,9 @@ def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, prom
     promised = {("drift", "here"): 50.0, ("radiation", "here"): promise, ("radiation", "there"): 27.0}
     directions = [SimpleNamespace(candidate=SimpleNamespace(key=k)) for k in promised]
     looked = SimpleNamespace(promised=[*zip(directions, promised.values(), strict=True)])
-    found = shortlist.elsewhere({("radiation", "there")}, 60.0, looked)
+    found = shortlist.elsewhere({("radiation", "there")}, 60.0, looked, [])
     assert [(d.candidate.key, gain) for (d,), gain in found] == [(("radiation", "here"), 60.0)] * tried
-    assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked)
+    assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked, [])
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ class KernelBus:
         self.ours.close()
         self.theirs.close()
 
-    def open(self, channel, interface, bitrate, can_filters):
+    def open(self, channel, interface, bitrate, can_filters, receive_own_messages):
         """In place of can.Bus."""
         return types.SimpleNamespace(socket=self.theirs, shutdown=lambda: None)
 

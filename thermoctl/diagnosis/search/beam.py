@@ -398,7 +398,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
     queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
     new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
-    queue += elsewhere(new, s.best.score - parent.score, looked)
+    queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""

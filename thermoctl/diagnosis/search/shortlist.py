@@ -78,10 +78,9 @@ def shortlist(
 ) -> list[Extension]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
-    First are those with at least half of the largest predicted gain, the best first. Then come those with the
-    largest gain in energy, then pairs, then the others: the largest promise may be false. The gain of a
-    proposal by energy is infinite. At most PLACES_EACH places of an effect are listed alone. `paired`: with
-    pairs that are not proposed by energy?"""
+    First are those with the largest predicted gain, the best first. Then come those with the largest gain in
+    energy, then pairs. The gain of a proposal by energy is infinite. At most PLACES_EACH places of an effect
+    are listed alone. `paired`: with pairs that are not proposed by energy?"""
     worthwhile = []
     for d, promise in looked.promised:
         gain = predicted(d, promise, where, limits)
@@ -90,28 +89,31 @@ def shortlist(
     worthwhile.sort(key=lambda x: -x[1])
     gains = {d.candidate.key: gain for d, gain in reversed(worthwhile)}
     best = foremost(once(d for d, _ in worthwhile), PLACES_EACH)[: limits.shortlist]
-    alone: list[Extension] = [((d,), gains[d.candidate.key]) for d in best]
-    strong = sum(HALF * gain > worthwhile[0][1] for _, gain in alone)
-    out = alone[:strong]
+    out: list[Extension] = [
+        ((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > worthwhile[0][1]
+    ]
     listed = {d.candidate.key for (d,), _ in out}
     out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in listed]
     if paired:
         out += pairs(looked.every, looked.metric, where, limits)
     if looked.energy:
         out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
-    return out + alone[strong:]
+    return out
 
 
-def elsewhere(leading: Collection[Key], gain: float, looked: Screened) -> list[Extension]:
+def elsewhere(
+    leading: Collection[Key], gain: float, looked: Screened, queue: Sequence[Extension]
+) -> list[Extension]:
     """Return the one effect that leads at other places, if it promised as much there as where it leads.
 
     It may gain there as much as it does (`gain`). Empty if several effects lead together."""
     if len(leading) != 1:
         return []
     ((name, where),) = leading
+    listed = {d.candidate.key for added, _ in queue for d in added} | {(name, where)}
     least = max((p for d, p in looked.promised if d.candidate.key == (name, where)), default=np.inf)
     others = [d for d, p in looked.promised if d.candidate.key[0] == name and p >= least]
-    return [((d,), gain) for d in others if d.candidate.key[1] != where and not relabels(d.candidate)]
+    return [((d,), gain) for d in others if d.candidate.key not in listed and not relabels(d.candidate)]
 
 
 def largest(looked: Screened) -> list[Direction]:
