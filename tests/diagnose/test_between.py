@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.bench.between import named
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import Memory
@@ -61,3 +62,10 @@ def test_a_diagnosis_that_goes_on_reads_inputs_as_before(tmp_path):
 def test_what_the_plant_file_states_is_not_asked(tmp_path):
     text = ONE_BLOCK.replace("{unit: W}", "{unit: W, between_samples: hold}", 1)
     assert not taken(text, True, tmp_path).plant.inputs["heat"].linear
+
+
+@pytest.mark.slow  # half a minute: two diagnoses
+def test_switches_between_rows_are_no_missing_physics():
+    """Held until the next row, the heater's steps are taken for a hidden mass."""
+    assert not named(25.0, 15, straight=True)
+    assert named(25.0, 15, straight=False)

@@ -285,14 +285,16 @@ def test_a_diode_is_an_exponential():
     assert abs(law.plant.parameters[own["s1"]].value * term.signals[0].size - 0.046) < 0.002
 
 
-def test_a_pump_that_feeds_another_vessel_than_the_plant_file_says_is_told():
+@pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])
+def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     pump = "inputs:\n  spare: {unit: V}\n"
+    stated, true = ("from: lower", {"source": "upper"}) if drains else ("into: upper", {"target": "lower"})
     text = TANKS.replace("inputs:\n", pump).replace(
-        "flows:\n", "flows:\n  fed: {into: upper, rate: 0.4 * spare}\n"
+        "flows:\n", f"flows:\n  moved: {{{stated}, rate: 0.2 * spare}}\n"
     )
     plant, t = loads(text), np.arange(0, 1200, 3.0)
-    fed = replace(plant.flows["fed"], target="lower", rate=ex.parse("0.4 * spare"))
-    truth = compile_plant(replace(plant, flows={**plant.flows, "fed": fed}))
+    moved = replace(plant.flows["moved"], **true)
+    truth = compile_plant(replace(plant, flows={**plant.flows, "moved": moved}))
     on = {"pump": 1 + (np.sin(t / 90) > 0), "spare": 0.5 + (np.sin(t / 140) > 0.2)}
     known = case(plant, [truth.measure(Table("run", "", t, on), 1)], {}, Budget(80))
     null = fitted(known, plant, (), known.null)
@@ -300,7 +302,7 @@ def test_a_pump_that_feeds_another_vessel_than_the_plant_file_says_is_told():
     led = [p for p in led if [(x.form.name, *x.variables) for x in p.terms] == [("linear", "spare")]]
     law = SimpleNamespace(proposal=led[0], fitted=refitted_law(known, null, led[0], null))
     (told,) = wrong_ends(known, law)
-    assert "flow 'fed' on to lower: it seems to end there, and not in upper" in told
+    assert "start at upper, and not lower" in told if drains else "end in lower, and not upper" in told
 
 
 @pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, {"even", "even_power"})])

@@ -14,6 +14,7 @@ from thermoctl.calibration.tune import Disagrees, tune
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import tuning
 from thermoctl.identify.measured_loop import Timing
+from thermoctl.rig.option import LIVE_STEP, TRIAL_FACTOR
 from thermoctl.rig.signals import INDEX
 from thermoctl_hal.base.backend import HardwareError
 
@@ -50,7 +51,7 @@ def test_slow_commands_are_dead_time_and_no_gain_grows_by_more_than_the_factor(t
     assert found.plant.theta_s >= 0.5 * (0.006 - truth.period_s), (
         "200 Hz at ticks of 2 ms: a command every third tick"
     )
-    assert found.proposed.kp == pytest.approx(tuning.FACTOR * 0.0005) and found.proposed.td_s == 0.0
+    assert found.proposed.kp == pytest.approx(TRIAL_FACTOR * 0.0005) and found.proposed.td_s == 0.0
     assert any("run it again" in line and "factor of 3" in line for line in said)
     assert not any("inf" in line for line in said)
 
@@ -104,7 +105,7 @@ def test_a_way_is_of_small_steps_within_the_factor(present, wanted, derivative):
     for one, other in zip(steps, steps[1:], strict=False):
         for name in ("kp", "ti_s", "td_s"):
             x, y = getattr(one, name), getattr(other, name)
-            assert x == y or 1 / (tuning.STEP * 1.0001) <= y / x <= tuning.STEP * 1.0001
+            assert x == y or 1 / (LIVE_STEP * 1.0001) <= y / x <= LIVE_STEP * 1.0001
             assert getattr(a, name) == 0 or 0.3333 <= y / getattr(a, name) <= 3.0001
 
 

@@ -20,6 +20,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import tuning
 from thermoctl.identify.measured_loop import Measured, Timing, disagreement, measure
 from thermoctl.identify.tuning import Gains, SecondOrder
+from thermoctl.rig.option import TRIAL_FACTOR
 from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
 
@@ -90,7 +91,7 @@ def tune(
     say(tuning.difference(present, proposed))
     if not refused and _speed(wanted) > FASTER * _speed(proposed):
         say(
-            f"no gain changes by more than a factor of {tuning.FACTOR:g} at once: run it again after this proposal"
+            f"no gain changes by more than a factor of {TRIAL_FACTOR:g} at once: run it again after this proposal"
         )
     if not verify:
         return Found(plant, present, proposed, before, None)

@@ -44,8 +44,6 @@ from thermoctl.rig.option import LIVE_STEP, TRIAL_FACTOR
 UNCERTAIN_DEG = 40.0
 ANSWERS = 10.0  # least gain of the response over its standard error; a fit to noise alone reaches 5
 WANTED_DEG, WANTED_GAIN = 45.0, 2.0  # least phase margin and gain margin of a proposal
-FACTOR = TRIAL_FACTOR  # largest change of a gain in one proposal
-STEP = LIVE_STEP  # largest change of a gain in one step on the rig
 TURNS = 3.0  # a loop's phase passes 180 deg at about this multiple of its crossover
 SHORTEST_S = 1e-6  # lag that stands for no lag
 BLOCK_S = 1.0  # length of a block of residuals; the blocks count as independent
@@ -107,8 +105,9 @@ def fit_response(
     """Fit the second order with dead time that gives positions y_um (N,) from drives (N,) at times t_s (N,).
 
     Row k holds the position read and the drive written in the same tick of `period_s`; a missing tick kept
-    the drive before it. least_s: the dead time is at least this. present: gains whose FACTOR is the fastest
-    loop that matters; None: any. Raises InputError when the recording does not determine the response."""
+    the drive before it. least_s: the dead time is at least this. present: the fastest loop
+    that matters has TRIAL_FACTOR times these gains; None: any. Raises InputError when the recording does not
+    determine the response."""
     ticks = np.round((np.asarray(t_s) - t_s[0]) / period_s).astype(int)
     n = int(ticks[-1]) + 1
     if len(ticks) < 20:
@@ -154,7 +153,7 @@ def fit_response(
     w = w[k : k + 1]  # the crossover with 60 degrees left
     if present is not None:
         fitted = model(best.x, float(x @ y / max(x @ x, 1e-300)))
-        w = np.minimum(w, TURNS * _crossover(fitted, replace(present, kp=FACTOR * present.kp)))
+        w = np.minimum(w, TURNS * _crossover(fitted, replace(present, kp=TRIAL_FACTOR * present.kp)))
     slope = [
         np.angle(model(best.x + d).frequency(w) / model(best.x - d).frequency(w))[0] / 2e-3
         for d in 1e-3 * np.eye(3)
@@ -337,9 +336,9 @@ def robust(
 
 
 def within_factor(present: Gains, wanted: Gains) -> Gains:
-    """Return the wanted gains, each within a factor of FACTOR of the present one."""
+    """Return the wanted gains, each within a factor of TRIAL_FACTOR of the present one."""
     kp, ti, td = (
-        min(max(b, a / FACTOR), a * FACTOR) if a > 0.0 else b
+        min(max(b, a / TRIAL_FACTOR), a * TRIAL_FACTOR) if a > 0.0 else b
         for a, b in zip(_three(present), _three(wanted), strict=True)
     )
     return replace(wanted, kp=kp, ti_s=ti, td_s=td)
@@ -348,10 +347,10 @@ def within_factor(present: Gains, wanted: Gains) -> Gains:
 def way(present: Gains, proposed: Gains) -> list[Gains]:
     """Return the gains of each step from the present to the proposed ones, the last included.
 
-    No gain changes by more than STEP in one step; a gain that is 0 stays 0."""
+    No gain changes by more than LIVE_STEP in one step; a gain that is 0 stays 0."""
     a, b = np.array(_three(present)), np.array(_three(proposed))
     ratio = np.where((a > 0.0) & (b > 0.0), b / np.where(a > 0.0, a, 1.0), 1.0)
-    n = max(1, int(np.ceil(np.abs(np.log(ratio)).max() / np.log(STEP) - 1e-9)))
+    n = max(1, int(np.ceil(np.abs(np.log(ratio)).max() / np.log(LIVE_STEP) - 1e-9)))
     steps = [a * ratio ** (k / n) for k in range(1, n)]
     return [
         *(replace(proposed, kp=kp, ti_s=ti, td_s=td) for kp, ti, td in map(np.ndarray.tolist, steps)),
@@ -364,8 +363,8 @@ def propose(
 ) -> list[Gains]:
     """Return the steps from the present gains towards the wanted ones; the last is the proposal.
 
-    No gain leaves FACTOR. Each step has the wanted margins on all models, or no smaller ones than the present
-    gains; its kp is lowered where it must be. Raises InputError where that does not help."""
+    No gain leaves TRIAL_FACTOR. Each step has the wanted margins on all models, or no smaller ones than
+    the present gains; its kp is lowered where it must be. Raises InputError where that does not help."""
     least = min(1.0, share_of_margins(models, present, period_s, moving_average))
     target = _slower(models, present, within_factor(present, wanted), 1.0, period_s, moving_average)
     return [
@@ -380,12 +379,12 @@ def propose(
 def _slower(
     models: Sequence[SecondOrder], present: Gains, gains: Gains, least: float, period_s: float, average: int
 ) -> Gains:
-    """Lower kp, to a FACTOR-th of the present one at most, until the share of the margins is `least`."""
+    """Lower kp, at most by TRIAL_FACTOR, until the share of the margins is `least`."""
     while share_of_margins(models, gains, period_s, average) < least:
         gains = replace(gains, kp=0.95 * gains.kp)
-        if gains.kp < present.kp / FACTOR:
+        if gains.kp < present.kp / TRIAL_FACTOR:
             raise InputError(
-                f"no gains within a factor of {FACTOR:g} of the present ones have {WANTED_DEG:g} deg and a factor of "
+                f"no gains within a factor of {TRIAL_FACTOR:g} of the present ones have {WANTED_DEG:g} deg and a factor of "
                 f"{WANTED_GAIN:g} of margin on this response: lower kp by hand, `thermoctl reload`, and run it again"
             )
     return gains

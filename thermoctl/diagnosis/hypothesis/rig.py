@@ -282,7 +282,7 @@ class Rig:
     def is_motor(self, f: Flow) -> bool:
         """Return whether a flow is a force or a torque that an input or a current drives."""
         moves = f.target in self.velocities or f.source in self.velocities
-        return moves and bool(ex.names(f.rate) & (self.moving_inputs | {*self.currents}))
+        return moves and bool(ex.names(f.rate) & self.moving_inputs.union(self.currents))
 
     def is_pump(self, f: Flow) -> bool:
         """Return whether a flow enters from outside and is neither heat nor a force."""

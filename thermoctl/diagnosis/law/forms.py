@@ -23,7 +23,6 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 
 LAW = "law"  # name of a law among the effects of a hypothesis
-NOISE = 0.02  # share of its largest value by which a signal that is nowhere negative may lie below zero
 
 
 @dataclass(frozen=True)
@@ -207,7 +206,7 @@ def families(
                 "input": z.recorded,
                 "loaded": z.drives,
             }
-            if form.twin and z.visited[0] >= -NOISE * z.visited[-1]:
+            if form.twin and z.visited[0] >= 0:
                 continue  # the recordings cannot tell the two apart
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})

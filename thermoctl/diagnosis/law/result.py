@@ -101,11 +101,11 @@ def described(p: Proposal, f: Fitted) -> str:
 
 
 def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
-    """Return a sentence for a flow of the plant that the law only leads from its end to another node."""
+    """Return a sentence for a flow of the plant that the law only leads to, or takes from, another node."""
     place, model, fit = law.proposal.place, law.fitted.fit.model, law.fitted.fit
     own, out = law_rate(law.fitted), []
     for f in model.plant.flows.values():
-        if place.part != "flow" or not place.source or f.target != place.source:
+        if not place.source or (f.target == place.source) == (f.source == place.target):
             continue
         moved, whole = [], []
         for d, values, dx0 in zip(case.drives(model), fit.values, fit.dx0, strict=True):
@@ -114,9 +114,12 @@ def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
             whole.append(ex.series(f.rate, names, d.t))
         apart = np.concatenate(moved) - np.concatenate(whole)
         if np.linalg.norm(apart) < SAME * np.linalg.norm(np.concatenate(whole)):
+            what, right, wrong = (
+                ("end in", *place.nodes[::-1]) if f.target == place.source else ("start at", *place.nodes)
+            )
             out.append(
-                f"the law leads all of the flow '{f.name}' on to {place.target}: it seems to end there, and not in "
-                f"{place.source}, as the plant file says"
+                f"the law moves all of the flow '{f.name}' from {place.source} to {place.target}: the flow seems to {what} "
+                f"{right}, and not {wrong}, as the plant file says"
             )
     return out
 

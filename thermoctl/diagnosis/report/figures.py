@@ -139,10 +139,11 @@ def with_interval(value: float, sd: float | None, unit: str | None = None) -> st
         return f"{value:.2g} (0 .. {value + half:.2g})"
     largest = max(abs(value), half)
     power = 0 if PLAIN[0] <= largest < PLAIN[1] else math.floor(math.log10(largest))
-    shown = []
-    for v, digits_of in ((value, min(abs(value) or half, half)), (half, half)):
-        places = 1 - math.floor(math.log10(digits_of)) + power
-        shown.append(f"{round(v * 10.0**-power, places):.{max(places, 0)}f}")
+    # a value smaller than its interval keeps two digits of its own
+    places = [1 - math.floor(math.log10(min(abs(v) or half, half))) + power for v in (value, half)]
+    shown = [
+        f"{round(v * 10.0**-power, k):.{max(k, 0)}f}" for v, k in zip((value, half), places, strict=True)
+    ]
     return " ± ".join(shown) if not power else f"({' ± '.join(shown)})e{power}"
 
 
