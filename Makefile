@@ -31,7 +31,8 @@ bench-law: develop                 # cost of a call of the law, by compiler
 	$(BIN)/python tests/bench/law_call.py
 
 # Tests that only compute share two cores; then those that run in real time have both to themselves.
-COMPUTED := $(addprefix tests/,advice api calibration checks concealed diagnose export fleet identify laws plant proof recording reproduction rigs truth)
+COMPUTED := $(addprefix tests/,advice api calibration checks concealed control diagnose disk export fleet fuzz identify laws \
+	people/test_extras.py plant proof recording reproduction rigs truth tune walkthrough) $(wildcard tests/test_*.py)
 # Property tests repeat the same examples (Hypothesis profile ci): a clean checkout that passes, passes again.
 EXAMPLES ?= ci
 test: develop lint                 # lint and all quick tests; EXAMPLES=default draws new examples of the properties
