@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -23,6 +23,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 
 LAW = "law"  # name of a law among the effects of a hypothesis
+MARK = "plant_"  # before a name of the plant in the expressions of a law
+NEGLIGIBLE = 0.2  # share of its typical size down to which a signal counts as nowhere negative
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,7 @@ def families(
                 "input": z.recorded,
                 "loaded": z.drives,
             }
-            if form.twin and z.visited[0] >= 0:
+            if form.twin and z.visited[0] >= -NEGLIGIBLE:
                 continue  # the recordings cannot tell the two apart
             if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
                 shapes = combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
@@ -230,12 +232,19 @@ def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np
     return dict(zip(values, np.reshape(chosen, (-1, len(values))).T, strict=True))
 
 
+def of_plant(e: Expr) -> Expr:
+    """Return an expression with the plant's names marked, so that an effect's symbols (air, s1) are others."""
+    return ex.fill(e, {n: name(MARK + n) for n in ex.names(e)})
+
+
 def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
-    """Return a law at a place as an entry of the catalogue."""
+    """Return a law at a place as an entry of the catalogue. It reads the plant's names as `of_plant`."""
     changes: list[dict[str, Any]] = []
     parameters: list[EffectParameter] = []
     rate: Expr = ex.ZERO
-    for k, term in enumerate(law, 1):
+    for k, bare in enumerate(law, 1):
+        own = tuple(replace(s, value=of_plant(s.value)) for s in bare.signals)
+        term = replace(bare, signals=own)
         rate = ex.add(rate, term.expression(k))
         parameters += [_parameter(f"{q}{k}", unit, ex.parse("s"), 0.0) for q in term.form.sizes]
         parameters += [
@@ -250,6 +259,8 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
     if place.part == "storage":
         changes.append({"storage": str(ex.add(name("storage"), rate))})
     else:
+        for k, (_, share) in enumerate(place.shares, 1):
+            changes.append({"flow": {"into": f"other{k}", "rate": str(ex.mul(of_plant(share), rate))}})
         ends = {"into": "target", **({"from": "source"} if place.source else {})}
         changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(LAW, "A law that the recordings propose", "", (tuple(changes),), tuple(parameters))

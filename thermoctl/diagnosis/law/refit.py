@@ -14,11 +14,12 @@ from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.law.forms import law_effect, library, readable
+from thermoctl.diagnosis.law.forms import law_effect, library, of_plant, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
+from thermoctl.plant.expression import name
 from thermoctl.plant.simulation.simulate import SimulationError
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
@@ -71,7 +72,10 @@ def law_candidate(rig: Rig, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
     effect = law_effect(p.terms, p.place, law_unit(rig.plant, p.place))
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
-    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig)
+    ends |= {f"other{k}": n for k, (n, _) in enumerate(p.place.shares, 1)}
+    read = [s.value for t in p.terms for s in t.signals] + [share for _, share in p.place.shares]
+    symbols = {str(of_plant(name(n)).value): name(n) for e in read for n in ex.names(e)}
+    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig, symbols=symbols)
 
 
 def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Effect:
@@ -164,6 +168,7 @@ def equation(f: Fitted, numbers: bool = False) -> str:
     c, text, values = law.candidate, readable(law_rate(f)), f.plant.parameters
     for q in c.effect.parameters:
         own = c.own(q.name)
-        shown = f"{values[own].value:.3g}" if numbers and own in values else q.name
+        short = own if q.name in {*f.plant.nodes, *f.plant.inputs} else q.name
+        shown = f"{values[own].value:.3g}" if numbers and own in values else short
         text = re.sub(rf"\b{re.escape(own)}\b", f"({shown})" if shown.startswith("-") else shown, text)
     return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)

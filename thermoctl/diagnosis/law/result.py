@@ -16,6 +16,7 @@ from thermoctl.diagnosis.evidence.held_out import Worth
 from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
+from thermoctl.diagnosis.law.forms import MARK
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import equation, law_rate
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
@@ -53,7 +54,7 @@ def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
         "share_closed": worth.share_closed,
         "held_out": worth.reserved,
         "equivalent": family(law),
-        "effect": effect_file(law),
+        "effect": None if place.flows else effect_file(law),
     }
 
 
@@ -204,7 +205,9 @@ def _general(
 
     def in_symbols(text: str) -> str:
         """Return an expression with the symbols of an effect file."""
-        return str(ex.fill(ex.parse(text), symbols))
+        e = ex.parse(text)
+        bare = {n: n.removeprefix(MARK) for n in ex.names(e) if n.startswith(MARK)}
+        return str(ex.fill(e, {n: symbols.get(own, name(own)) for n, own in bare.items()}))
 
     ((kind, what),) = change.items()
     if isinstance(what, str):
@@ -246,6 +249,10 @@ def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> Path:
         )
     if not label.isidentifier():
         raise InputError(f"'{label}': a name of letters, digits and _ was expected, such as windage")
+    if not law["effect"]:
+        raise InputError(
+            f"the law acts in the flows {law['where']} of this plant alone; a law in one flow or storage was expected"
+        )
     make_folder(folder)
     path = folder / f"{label}.yaml"
     if path.exists():

@@ -9,11 +9,12 @@ import numpy as np
 
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, Rig, zero_of
 from thermoctl.plant import expression as ex
-from thermoctl.plant.expression import Expr, name
+from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
 from thermoctl.units import conversion, dimension
 
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
+DRAWS = 5  # number of values of all names for which two rates are compared
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
 Values = Mapping[str, np.ndarray | float]
@@ -24,23 +25,35 @@ class Place:
     """Where a law acts.
 
     - flow: into the node `target` from outside, or from the node `source`
-    - storage: of the node `target`"""
+    - storage: of the node `target`
+    - conversion: a flow that the plant file writes as several flows in proportion, `flows`. For each unit into
+      the target a share, an expression of parameters, goes into other nodes: `shares`"""
 
     target: str
     source: str | None = None
     part: str = "flow"
+    flows: tuple[str, ...] = ()
+    shares: tuple[tuple[str, Expr], ...] = ()
 
     @property
     def where(self) -> str:
         """Return its name in a result."""
         if self.part != "flow":
             return f"{self.part} of {self.target}"
+        if self.flows:
+            return " and ".join(self.flows)
         return f"{self.source}-{self.target}" if self.source else self.target
 
     @property
     def nodes(self) -> tuple[str, ...]:
         """Return the nodes that it changes."""
-        return (self.source, self.target) if self.source else (self.target,)
+        return tuple(n for n, _ in reversed(self.ends))
+
+    @property
+    def ends(self) -> tuple[tuple[str, Expr], ...]:
+        """Return the nodes that it changes, the target first, each with its share of the flow."""
+        source = ((self.source, num(-1.0)),) if self.source else ()
+        return ((self.target, ex.ONE), *source, *self.shares)
 
 
 @dataclass(frozen=True)
@@ -80,7 +93,52 @@ def places(rig: Rig) -> list[Place]:
     ]
     pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
     stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
-    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored]
+    joined = conversions(rig.physics, nodes)
+    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored, *joined]
+
+
+def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:
+    """Return the flows into and out of some nodes that are always in proportion, as places.
+
+    Prey that is eaten and predators that grow are two flows of one rate. So are water that evaporates and
+    the heat that it takes. The factor is a parameter, one over it, or a number."""
+    able = [f for f in plant.flows.values() if {f.source, f.target} - {None} <= {*nodes}]
+    out, taken = list[Place](), set[str]()
+    for first in sorted(able, key=lambda f: f.target is None):
+        if first.name in taken:
+            continue
+        joined, shares = [first.name], dict[str, Expr]()
+        for f in able:
+            factor = None if f is first or f.name in taken else _factor(plant, first.rate, f.rate)
+            if factor is None or {f.source, f.target} & {first.source, first.target, *shares} - {None}:
+                continue
+            joined.append(f.name)
+            shares |= {n: q for n, q in ((f.source, ex.neg(factor)), (f.target, factor)) if n}
+        if shares:
+            if first.target is None:
+                shares = {n: ex.neg(q) for n, q in shares.items()}
+            target = first.target or str(first.source)
+            source = first.source if first.target else None
+            out.append(Place(target, source, "flow", tuple(joined), tuple(shares.items())))
+            taken |= {*joined}
+    return out
+
+
+def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
+    """Return b / a if this is a parameter, one over one, or a number, whatever all values are; else None."""
+    read = sorted(ex.names(a) | ex.names(b))
+    drawn = np.random.default_rng(0).uniform(0.5, 2.0, (len(read), DRAWS))
+    values = dict(zip(read, drawn, strict=True))
+    try:
+        ratio = np.asarray(ex.evaluate(b, values) / ex.evaluate(a, values), float)
+    except ex.ExpressionError:
+        return None  # it reads a table or a delay
+    own = {q: v for q, v in values.items() if q in plant.parameters}
+    known = [(num(float(ratio.flat[0])), ratio.flat[0])]
+    known += [(name(q), v) for q, v in own.items()] + [
+        (ex.div(ex.ONE, name(q)), 1 / v) for q, v in own.items()
+    ]
+    return next((e for e, v in known if ratio.shape == (DRAWS,) and np.allclose(ratio, v, 1e-9, 0.0)), None)
 
 
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:

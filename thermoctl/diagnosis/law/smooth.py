@@ -149,10 +149,11 @@ def _pushed(metric: Metric, place: Place, flows: Sequence[np.ndarray], r: int) -
     """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
     model, t = metric.model, metric.drives[r].t
     forces, q = list[tuple[int, int]](), []
-    for k, node in enumerate(reversed(place.nodes)):
+    for node, share in place.ends:
         storage = ex.series(model.plant.nodes[node].storage, metric.signals[r], t)
+        part = ex.series(share, metric.signals[r], t)
         forces += [(model.states.index(node), c) for c in range(flows[r].shape[1])]
-        q.append((-1) ** k * np.nan_to_num(flows[r]) / storage[:, None])
+        q.append(np.nan_to_num(flows[r]) * (part / storage)[:, None])
     return Pushed(forces, np.concatenate(q, axis=1), {})
 
 
