@@ -37,7 +37,7 @@ def deviations(
     A parameter of the plant at its bound is held there: it cannot absorb part of an effect. A reading that
     jumps tells between which samples, not when."""
     problem, plant_parameters, out = posterior.problem, posterior.case.plant.parameters, dict[str, float]()
-    moves = np.array([q not in bounds or q not in plant_parameters for q, _ in problem.unknowns])
+    moves = np.array([q not in bounds or q not in plant_parameters for q, _ in problem.unknowns], bool)
     sd = np.zeros(len(moves))
     inverse = np.linalg.pinv(curvature[np.ix_(moves, moves)], hermitian=True)
     sd[moves] = np.sqrt(np.maximum(np.diag(inverse), 0.0))

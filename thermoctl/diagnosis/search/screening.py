@@ -17,7 +17,7 @@ from thermoctl.diagnosis.search.fine import above, fine
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
-from thermoctl.diagnosis.search.screen import Norms, Select, screen
+from thermoctl.diagnosis.search.screen import Norms, Select, screen, sharpened
 from thermoctl.diagnosis.search.sketch import likeliest
 
 LOUD = 2.0  # residual's rms over the noise, from which energy is the better guide
@@ -75,10 +75,10 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
         select = known.likeliest
     keep = None if known.count else known.add
     best, *rest = screen(metrics, rig, placed, select=select, norms=norms, keep=keep)
-    promised = [(d, _promise(metric, d)) for d in foremost(best, ROOM * PLACES_EACH)[:PROMISED]]
+    promised = [(d, _promise(metric, d)) for d in _foremost(metric, rig, best)]
     by_energy = rest[0] if rest else []
     if other:
-        again = [(d, _promise(other, d)) for d in foremost(by_energy, ROOM * PLACES_EACH)[:PROMISED]]
+        again = [(d, _promise(other, d)) for d in _foremost(other, rig, by_energy)]
         by_key = {d.candidate.key: promise for d, promise in promised}
         promised = [(d, p) for d, p in promised if p >= 0] + [
             (dataclasses.replace(d, vector=None), p)  # its vector is of another metric
@@ -106,6 +106,11 @@ def places(case: Case) -> dict[str, set[str]]:
         if not c.place.input or c.effect.name not in usual:
             out.setdefault(c.effect.name, set()).add(c.place.where)
     return out
+
+
+def _foremost(metric: Metric, rig: Rig, found: list[Direction]) -> list[Direction]:
+    """Return the directions whose gain is predicted, events at their best times: the grid's are too rough."""
+    return [sharpened(metric, rig, d) for d in foremost(found, ROOM * PLACES_EACH)[:PROMISED]]
 
 
 def _promise(metric: Metric, d: Direction) -> float:
