@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
@@ -10,6 +12,7 @@ from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import Search, started
+from thermoctl.diagnosis.search.refits import refitted
 from thermoctl.diagnosis.search.screening import LOUD, Screened, screened
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -53,3 +56,33 @@ def test_an_error_that_repeats_quickly_in_time_is_seen_whatever_its_number_of_pe
     table.columns["encoder"] = x + 1e-7 * np.sin(2 * np.pi * x / period)
     _, looked = looked_at(SPRING_STAGE, table)
     assert promise(looked, "cyclic_error", "encoder") > 10
+
+
+def test_a_jump_promises_what_its_refit_gains_between_the_times_of_the_grid():
+    """At the nearest of the grid's times it promised a tenth, and two false names were as good."""
+    t = np.arange(0.0, 7200.0, 10.0)
+    drives = {"heat": 1 + (np.sin(t / 700) > 0), "air_temperature": 21 + t / 7200}
+    table = compile_plant(loads(TWO_BLOCKS)).measure(Table("run", "run", t, drives), seed=2)
+    table.columns["temperature_1"] = table.columns["temperature_1"] + 0.7 * (t > 4010)
+    search, looked = looked_at(TWO_BLOCKS, table)
+    found = next(d for d, _ in looked.promised if d.candidate.key == ("sensor_offset_step", "temperature_1"))
+    assert abs(found.shape["onset"] - 4015) <= 10
+    (refit,) = refitted(search.case, search.best.fitted, looked, [((found,), 0.0)], search.best.fitted)
+    gained = refit.log_likelihood - search.best.fitted.log_likelihood
+    assert 0.7 * gained < promise(looked, "sensor_offset_step", "temperature_1") < 1.5 * gained
+
+
+def test_a_plant_without_unknowns_is_screened_and_refitted():
+    """Nothing of it is free, not even a start: the plant alone ended in an IndexError."""
+    known = re.sub(", range: [^}]*|, initial_sigma: 0.5", "", TWO_BLOCKS)
+    t = np.arange(400) * 10.0
+    table = Table("run", "run", t, {"heat": 1 + (np.sin(t / 300) > 0), "air_temperature": np.full(400, 21.0)})
+    table = compile_plant(loads(known)).measure(table, seed=1)
+    table.columns["temperature_2"] = table.columns["temperature_2"] + 0.3
+    search, looked = looked_at(known, table)
+    assert not search.best.fitted.fit.model.unknowns
+    assert (
+        promise(looked, "sensor_drift", "temperature_2")
+        + promise(looked, "sensor_offset_step", "temperature_2")
+        > 20
+    )

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from scipy.integrate import solve_ivp
 
 from tests.bench.scale import block_plant
 from tests.laws.prove import EQUAL, cases, difference
@@ -28,16 +29,17 @@ from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Term, families, library
-from thermoctl.diagnosis.law.propose import PROPOSALS, propose_laws
+from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal, propose_laws
 from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
 from thermoctl.diagnosis.law.refit import law_of as placed_law
 from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect, wrong_ends
-from thermoctl.diagnosis.law.signals import Place, Signal, signals
+from thermoctl.diagnosis.law.signals import Place, Signal, conversions, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.metric import Metric, Plain
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant import load, loads, save
 from thermoctl.plant.language import Flow, Input, Node, Plant
@@ -164,7 +166,15 @@ def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
     assert c.place.nodes == {"target": "shell"} and "shell" not in known.plant.nodes
 
 
-@pytest.mark.parametrize("place", [Place("one"), Place("two", "one"), Place("one", None, "storage")])
+@pytest.mark.parametrize(
+    "place",
+    [
+        Place("one"),
+        Place("two", "one"),
+        Place("one", None, "storage"),
+        Place("one", None, "flow", ("loss_1", "loss_2"), (("two", ex.num(-0.5)),)),
+    ],
+)
 def test_a_plant_with_a_law_of_any_form_at_any_place_can_be_read_again(found, place, tmp_path):
     """A law of the past in a storage brought a flow 'law_storage of velocity': its diagnosis ended in an error."""
     plant = loads(TWO_BLOCKS)
@@ -177,6 +187,102 @@ def test_a_plant_with_a_law_of_any_form_at_any_place_can_be_read_again(found, pl
         save(made, tmp_path / "plant.yaml")
         again = load(tmp_path / "plant.yaml")
         assert (again.nodes.keys(), again.flows.keys()) == (made.nodes.keys(), made.flows.keys())
+
+
+def test_a_law_reads_the_plants_names_and_no_symbols_of_an_effect():
+    """A node `air` was read as the ambient, which is another signal, and a node `s1` as the shape s1."""
+    text = TWO_BLOCKS.replace("air: {", "outside: {role: ambient, ").replace(" air", " outside")
+    plant = loads(re.sub(r"\bone\b", "air", re.sub(r"\btwo\b", "s1", text)))
+    rig = Rig(plant, [], [])
+    assert rig.air == "outside"
+    read = [Signal(n, ex.name(n), "K", size=2.0) for n in ("air", "s1")]
+    terms = tuple(Term(next(f for f in library() if f.name == "tanh"), (s,), {"s": 0.5}) for s in read)
+    law = Proposal(Place("s1"), terms, (1.0, 1.0), 0.0, 0.0, limits())
+    c = law_candidate(rig, law)
+    made = c.extend({"A1": 3.0, "A2": 5.0, "Z1": 2.0, "Z2": 2.0, "s1": 0.5, "s2": 0.5})
+    (flow,) = (f for f in made.flows.values() if "law" in f.name)
+    own = {q: p.value for q, p in made.parameters.items()}
+    got = ex.evaluate(flow.rate, {**own, "air": 1.5, "s1": -0.4, "outside": 99.0})
+    assert flow.target == "s1" and got == pytest.approx(3 * np.tanh(1.5) + 5 * np.tanh(-0.4))
+
+
+ECOSYSTEM = """format: thermoctl-plant/1
+title: Plankton and what grazes it
+parameters:
+  r: {value: 0.7}
+  a: {value: 0.2, range: [0.02, 2]}
+  kept: {value: 0.6}
+  m: {value: 0.25}
+nodes:
+  algae: {storage: 1, initial: 2.0}
+  grazers: {storage: 1, initial: 0.6}
+flows:
+  growth: {into: algae, rate: r * algae * (1 - algae / 8)}
+  grazing: {from: algae, rate: a * algae * grazers}
+  gain: {into: grazers, rate: kept * a * algae * grazers}
+  death: {from: grazers, rate: m * grazers}
+outputs:
+  chlorophyll: {value: algae, noise: 0.08}
+  count: {value: grazers, noise: 0.04}
+"""
+
+
+def test_a_law_of_a_conversion_acts_in_all_its_flows(tmp_path):
+    """Grazing that saturates, by scipy: at one of the two nodes alone it had been a switch."""
+    t = np.arange(0.0, 60.0, 0.25)
+
+    def rates(_, x):
+        eaten = 0.9 * x[0] ** 2 / (1.6**2 + x[0] ** 2) * x[1]
+        return 0.7 * x[0] * (1 - x[0] / 8) - eaten, 0.6 * eaten - 0.25 * x[1]
+
+    x = solve_ivp(rates, (0, 60), [2.0, 0.6], t_eval=t, rtol=1e-9, atol=1e-9).y
+    rng = np.random.default_rng(4)
+    noisy = x + rng.normal(size=x.shape) * np.array([[0.08], [0.04]])
+    table = Table("run", "", t, dict(zip(("chlorophyll", "count"), noisy, strict=True)))
+    d = diagnose(loads(ECOSYSTEM), [table], {}, limits())
+    place = d.law.proposal.place
+    assert (place.flows, place.target, [n for n, _ in place.shares]) == (
+        ("gain", "grazing"),
+        "grazers",
+        ["algae"],
+    )
+    laws = [f for f in d.final.plant.flows.values() if "law" in f.name]
+    own = {q: p.value for q, p in d.final.plant.parameters.items()} | {"algae": x[0], "grazers": x[1]}
+    found = {f.target: ex.evaluate(f.rate, own) for f in laws}
+    assert found["algae"] == pytest.approx(-found["grazers"] / 0.6)
+    whole = found["grazers"] + 0.6 * own["a"] * x[0] * x[1]
+    assert np.std(whole - 0.54 * x[0] ** 2 / (1.6**2 + x[0] ** 2) * x[1]) < 0.05 * np.std(whole)
+    entry = law_entry(d.law, d.worth)
+    assert entry["where"] == "gain and grazing" and entry["effect"] is None
+    assert ", -(1 / kept) times it into algae, " in law_sentence(entry)
+    with pytest.raises(InputError, match="gain and grazing of this plant alone"):
+        save_effect({"remainder": {"law": entry}}, "eaten", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("second", "share"),
+    [
+        ("rate: a * algae / m}", ("grazers", "1 / m")),
+        ("rate: 2.5 * a * algae}", ("grazers", "2.5")),
+        ("rate: r * a * algae}", ("grazers", "r")),
+        ("rate: a * algae + m}", None),
+        ("rate: a * algae * grazers}", None),
+    ],
+)
+@pytest.mark.parametrize("end", ["into", "from"])
+def test_flows_that_are_always_in_proportion_are_one_place(second, share, end):
+    text = ECOSYSTEM.split("flows:")[0] + "flows:\n  one: {into: algae, rate: a * algae}\n"
+    text += "  rest: {from: algae, rate: r * kept * m * algae**2}\n"
+    text += f"  two: {{{end}: grazers, {second}\noutputs:" + ECOSYSTEM.split("outputs:")[1]
+    plant = loads(text)
+    found = conversions(plant, list(plant.nodes))
+    assert bool(found) == bool(share)
+    if share:
+        sign = "" if end == "into" else "-"
+        (((node, e),),) = [p.shares for p in found]
+        values = {q: p.value for q, p in plant.parameters.items()}
+        wanted = ex.evaluate(ex.parse(f"{sign}({share[1]})"), values)
+        assert (node, ex.evaluate(e, values)) == (share[0], pytest.approx(wanted))
 
 
 def test_parameters_that_scale_together_absorb_no_flow():
@@ -305,7 +411,7 @@ def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     assert "start at upper, and not lower" in told if drains else "end in lower, and not upper" in told
 
 
-@pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, {"even", "even_power"})])
+@pytest.mark.parametrize(("least", "twins"), [(0.1, set()), (-0.1, set()), (-1.0, {"even", "even_power"})])
 def test_a_signal_that_is_nowhere_negative_is_not_tried_with_two_equal_forms(least, twins):
     """Of a leak of a tank, abs(z)**n and sign(z) * abs(z)**n had half the probability each, and an experiment."""
     signal = Signal("z", ex.name("z"), None, visited=(least, 0.5, 1.0))

@@ -42,6 +42,7 @@ def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
         "expression": equation(f),
         "into": place.target,
         "from": place.source,
+        "shares": {node: str(share) for node, share in place.shares},
         "terms": [str(t.expression(k)) for k, t in enumerate(p.terms, 1)],
         "forms": _terms(p),
         "memory": {f"m{k}": t.memory_text(k) for k, t in enumerate(p.terms, 1) if t.form.memory},

@@ -104,6 +104,7 @@ def law_sentence(entry: Result | None) -> str:
     )
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
     ends = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
+    ends += "".join(f", {share} times it into {node}" for node, share in entry.get("shares", {}).items())
     acts = (
         f"a flow {ends}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
     )
