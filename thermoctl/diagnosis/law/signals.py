@@ -102,7 +102,11 @@ def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:
 
     Prey that is eaten and predators that grow are two flows of one rate. So are water that evaporates and
     the heat that it takes. The factor is a parameter, one over it, or a number."""
-    able = [f for f in plant.flows.values() if {f.source, f.target} - {None} <= {*nodes}]
+    able = [
+        f
+        for f in plant.flows.values()
+        if {f.source, f.target} - {None} <= {*nodes} and not ex.calls_fmu(f.rate)
+    ]
     out, taken = list[Place](), set[str]()
     for first in sorted(able, key=lambda f: f.target is None):
         if first.name in taken:
@@ -130,15 +134,19 @@ def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
     drawn = np.random.default_rng(0).uniform(0.5, 2.0, (len(read), DRAWS))
     values = dict(zip(read, drawn, strict=True))
     try:
-        ratio = np.asarray(ex.evaluate(b, values) / ex.evaluate(a, values), float)
+        each = [[ex.evaluate(e, dict(zip(read, v, strict=True))) for v in drawn.T] for e in (a, b)]
     except ex.ExpressionError:
-        return None  # it reads a table or a delay
+        return None  # it reads a delay
+    with np.errstate(all="ignore"):
+        ratio = np.divide(each[1], each[0])
+    if not ratio.all():
+        return None
     own = {q: v for q, v in values.items() if q in plant.parameters}
     known = [(num(float(ratio.flat[0])), ratio.flat[0])]
     known += [(name(q), v) for q, v in own.items()] + [
         (ex.div(ex.ONE, name(q)), 1 / v) for q, v in own.items()
     ]
-    return next((e for e, v in known if ratio.shape == (DRAWS,) and np.allclose(ratio, v, 1e-9, 0.0)), None)
+    return next((e for e, v in known if np.allclose(ratio, v, 1e-9, 0.0)), None)
 
 
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
