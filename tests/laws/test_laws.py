@@ -153,6 +153,9 @@ def test_an_experiment_separates_laws_that_fit_about_as_well(found):
     assert re.match(law_with_numbers, entry["separates"][0]["hypothesis"])
     undecided.law = replace(law, placed=replace(law.placed, rivals=()))
     assert propose(undecided) is None
+    itself = ((law.proposal, law.fitted, 0.4),)
+    undecided.law = replace(law, placed=replace(law.placed, rivals=itself))
+    assert propose(undecided) is None, "0.00 bits are no experiment"
 
 
 @pytest.mark.parametrize("part", ["flow", "storage"])

@@ -51,6 +51,7 @@ SHARES = (1.0, 0.7, 0.5, 0.3)
 DECIDES = 20.0  # least D that decides between two hypotheses: mean odds of e^(D/2)
 # Variance of a parameter that is new in every recording: anything within its range (z from 0 to 1).
 IN_RANGE = 0.09
+LEAST_BITS = 0.06  # an experiment that tells less is not worth rig time
 WORTH_A_SENSOR = 0.1  # least information in bits that a further sensor must add to be proposed
 
 Standing = tuple[Fitted, float, str]  # a fitted hypothesis, its probability, its name
@@ -254,7 +255,7 @@ def propose(
 ) -> tuple[dict[str, Any], Excitation] | None:
     """Choose the next experiment of an undecided diagnosis: the result's entry, and its excitation.
 
-    None if all is decided (`survivors`) or no input can be driven.
+    None if all is decided (`survivors`), no input can be driven, or no experiment tells forms of a law apart.
     `limits`: {input or output: (low, high)} of the rig. Raises InputError for a name that is neither."""
     case = diagnosis.case
     for n in limits:
@@ -282,6 +283,8 @@ def propose(
             most = max(t.bits for t in trials)
             enough = (t for t in trials if t.bits >= ENOUGH * most)
             best = max(enough, key=lambda t: t.bits / t.excitation.duration_s)
+            if best.bits < LEAST_BITS and diagnosis.law:
+                return None  # forms of one law that no experiment tells apart serve alike
             return _entry(comparison, best, len(trials)), best.excitation
     return None
 

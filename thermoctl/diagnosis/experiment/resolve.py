@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnosis.experiment.file import FILES
+from thermoctl.diagnosis.experiment.propose import LEAST_BITS
 from thermoctl.files.safe_file import write_text
-
-LEAST_BITS = 0.06  # an experiment that tells less is not worth rig time
 
 
 def worth_running(proposed: Mapping[str, Any] | None) -> bool:

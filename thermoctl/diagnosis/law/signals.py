@@ -139,7 +139,7 @@ def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
         return None  # it reads a delay
     with np.errstate(all="ignore"):
         ratio = np.divide(each[1], each[0])
-    if not ratio.all():
+    if not np.all(np.isfinite(ratio) & (ratio != 0)):
         return None
     own = {q: v for q, v in values.items() if q in plant.parameters}
     known = [(num(float(ratio.flat[0])), ratio.flat[0])]
