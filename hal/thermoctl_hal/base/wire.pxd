@@ -78,6 +78,7 @@ cdef class CanPort:
     cdef Frame[MAX_FRAMES] _own
     cdef Frame[MAX_ECHOES] _sent
     cdef long _sent_count, _echoed
+    cdef bint _drops
 
     cdef void _note_sent(self) noexcept
     cdef bint _is_echo(self, const Frame *frame) noexcept

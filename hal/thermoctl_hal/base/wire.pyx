@@ -547,6 +547,10 @@ cdef class CanPort:
         self._count += 1
         return True
 
+    def drop_echoes(self) -> None:
+        """Drop frames that the adapter hands back (CiA 402: no drive answers with the frame that it took)."""
+        self._drops = True
+
     cdef void _note_sent(self) noexcept:
         """Remember the queued frames, and empty the queue."""
         cdef int k
@@ -563,6 +567,8 @@ cdef class CanPort:
         cdef long k, first = self._echoed
         cdef long end = self._sent_count if first else min(self._sent_count, 1)
         cdef Frame *sent
+        if not self._drops:
+            return False
         if self._sent_count > first + MAX_ECHOES:
             if not first:
                 return False

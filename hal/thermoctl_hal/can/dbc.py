@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import lru_cache
@@ -22,6 +23,7 @@ if TYPE_CHECKING:  # loading cantools takes a second
 
 _Entry = tuple["DbcMessage", list[tuple[int, DbcSource]], list[str]]
 CLASSIC_BYTES = 8  # longest data of a frame that is not CAN FD
+ECHOES = 64  # own frames that may still come back from an adapter
 
 
 class DbcDevice(Device):
@@ -219,8 +221,8 @@ def _shown(can_id: int) -> str:
 class DbcDrive(Commanded, DbcDevice):
     """An amplifier that takes messages of a DBC file.
 
-    A frame with the identifier of a message of ours is another master's. A message of which a channel is
-    bound comes from the amplifier, too, and is not checked.
+    A frame with the identifier of a message of ours is another master's, unless it is the echo of one that
+    we sent. A message of which a channel is bound comes from the amplifier, too, and is not checked.
     """
 
     def __init__(self, binding: Binding) -> None:
@@ -229,11 +231,14 @@ class DbcDrive(Commanded, DbcDevice):
         names = {typed(m, CanMessage).name for m in (a.command, *a.set_up, *a.enable, *a.disable, *a.reset)}
         ids = {self._spec.can_id(name, binding.address): name for name in names}
         self._commands = {i: n for i, n in ids.items() if not {i, pgn_of(i)} & self._messages.keys()}
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=ECHOES)
 
     def _take(self, sample: Sample, can_id: int, data: bytes, now_s: float) -> None:
         """Store the readings of a frame. Raises HardwareError for a command of another master."""
         if can_id not in self._commands:
             super()._take(sample, can_id, data, now_s)
+        elif (can_id, data) in self._sent:
+            self._sent.remove((can_id, data))
         else:
             raise HardwareError(
                 f"another device on {self.binding.port} sends {self._commands[can_id]}, {_shown(can_id)}, which "
@@ -246,6 +251,7 @@ class DbcDrive(Commanded, DbcDevice):
         if self._port is None:
             raise HardwareError("not connected")
         can_id, data = can_frame(message, self._spec, command, self.binding.address)
+        self._sent.append((can_id, data))
         if len(data) > CLASSIC_BYTES:
             self._port.send_long(can_id, data)
         else:
