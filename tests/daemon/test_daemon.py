@@ -14,7 +14,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
+import pyarrow as pa
 import pytest
+import yaml
 
 from tests.daemon.process import LIMIT_S, ROOT, Daemon, wait
 from thermoctl.cli import main
@@ -94,6 +96,26 @@ def test_reload_applies_whole_files_only(daemon):
     wait(lambda: daemon.ask("status")["generation"] == 2, "the reload by SIGHUP")
     now = daemon.ask("status")
     assert now["state"] == "ARMED" and now["ticks"] > before and now["setpoint_um"] == 3.0
+
+
+def test_the_gains_of_a_reload_are_in_its_recording_and_outlast_the_command_process(config):
+    """The new file had the new gains for a replay, and the old ones in its configuration."""
+    daemon = Daemon(config)
+    try:
+        wait(lambda: daemon.ask("status")["recorder"]["rows"] > 0, "the recorder")
+        config.write_text(config.read_text().replace("kp: 0.01", "kp: 0.012"))
+        assert daemon.ask("reload")["applied"] == ["control.kp"]
+        folder = Path(daemon.settings.recording.directory)
+        wait(lambda: len([*folder.glob("*Z.arrows")]) == 2, "a new file")
+        texts = [
+            pa.ipc.open_stream(f).schema.metadata[b"config"].decode()
+            for f in sorted(folder.glob("*Z.arrows"))
+        ]
+        assert [yaml.safe_load(text)["control"]["kp"] for text in texts] == [0.01, 0.012]
+        os.kill(daemon.child("commands"), signal.SIGKILL)
+        wait(lambda: daemon.ask("gains")["kp"] == 0.012, "the gains from the new command process")
+    finally:
+        daemon.kill()
 
 
 JUMPS = (

@@ -468,3 +468,51 @@ def test_a_file_is_read_again_when_it_has_changed(tmp_path):
     path.unlink()
     with pytest.raises(OSError):
         read_eds(path)
+
+
+FLOAT = 'BO_ 801 READING: 8 DEV\n SG_ Volts : 0|32@1- (1,0) [0|0] "V" HOST\n\n'
+KINDS = {
+    "cut off": "SIG_VALTYPE_ 801 Volts : 1\n",
+    "cut off, a fault elsewhere": FAULTS["a factor without a zero"] + "SIG_VALTYPE_ 801 Volts : 1\n",
+    "hexadecimal": "SIG_VALTYPE_ 0x321 Volts : 1;\n",
+    "another end": "SIG_VALTYPE_ 801 Volts : 1,\n",
+    "small letters": "sig_valtype_ 801 Volts : 1;\n",
+}
+
+
+@pytest.mark.parametrize("line", KINDS.values(), ids=KINDS)
+def test_a_float_whose_kind_cannot_be_read_is_no_whole_number(tmp_path, line):
+    """2.5 V was read as 1075838976 V."""
+    with pytest.raises(InputError, match="Volts : 1.*no line of the format"):
+        device(tmp_path, START + FLOAT + line, [V], "{v: voltage_v}")
+
+
+NESTED = (
+    'BO_ 801 READING: 8 DEV\n SG_ Page M : 0|8@1+ (1,0) [0|0] "" HOST\n SG_ Sub m1M : 8|8@1+ (1,0) [0|0] "" HOST\n'
+    ' SG_ Volts m3 : 16|16@1- (0.01,0) [0|0] "V" HOST\n\n'
+)
+PAGES = "SG_MUL_VAL_ 801 Sub Page 1-1;\nSG_MUL_VAL_ 801 Volts Sub 3-3;\n"
+
+
+@pytest.mark.parametrize("text", [NESTED, NESTED.replace("m1M", "").replace(" M ", " ")])
+def test_a_page_that_nothing_selects_is_refused(tmp_path, text):
+    """The signal was read from the frames of every page."""
+    with pytest.raises(InputError, match="select its page: add SG_MUL_VAL_"):
+        device(tmp_path, START + text, [V], "{v: voltage_v}")
+
+
+@pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
+def test_nested_pages_are_told_apart(tmp_path, fault):
+    dev = device(tmp_path, START + fault + NESTED + PAGES, [V], "{v: voltage_v}")
+    frame = bytes([1, 3, 0xD2, 4, 0, 0, 0, 0])
+    assert read(dev, (801, frame)).value[ROLE["voltage_v"]] == pytest.approx(12.34)
+    for other in (bytes([1, 2]), bytes([2, 3])):
+        assert read(dev, (801, other + frame[2:])).status[ROLE["voltage_v"]] != OK
+
+
+@pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
+def test_a_number_that_the_file_names_as_no_value_is_none(tmp_path, fault):
+    words = 'VAL_ 801 T 255 "SNA" 254 "Error" ;\n'
+    dev = device(tmp_path, (START + fault + GOOD + words).encode("cp1252"), [T], "{t: air_c}")
+    for raw, status in ((255, ERROR), (60, OK)):
+        assert read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]] == status

@@ -324,3 +324,50 @@ def test_a_rig_without_a_plant_is_told_what_the_virtual_rig_needs(tmp_path):
     path.write_text(re.sub(r"  plant: .*\n", "", text))
     with pytest.raises(InputError, match=r"rig.yaml: hal.plant is missing: .*outputs carry the roles' names"):
         VirtualRig(load_settings(path))
+
+
+class Echo:
+    """An adapter's own node: it hands back every frame that the host sends, before any answer."""
+
+    def __init__(self):
+        self.frames, self.count = [], 0
+
+    def take(self, frame, now_s):
+        self.frames.append(frame)
+        self.count += 1
+
+    def due(self, now_s):
+        frames, self.frames = self.frames, []
+        return frames
+
+
+@pytest.mark.parametrize("echoes", [True, False])
+@pytest.mark.parametrize(
+    "frame,message",
+    [
+        ((0x205, bytes(6)), "two masters would drive one axis"),
+        ((0x77A, b"\x05"), "sends the heartbeat 0x77A"),
+    ],
+)
+def test_an_slcan_adapter_that_echoes_is_told_from_a_second_master(wire, echoes, frame, message):
+    """The heartbeat of the other master has the same bytes as ours."""
+    line, echo = wire.rig.devices["drive"].line, Echo()
+    if echoes:
+        line.nodes.insert(0, echo)
+    b = make_backend(wire.settings)
+    b.open()
+    try:
+        wire.drive, wire.enable = 0.25, True
+        drive = wire.rig.devices["drive"].drive
+        ticks = iter(range(1500))  # more frames than an adapter may hold back
+        wire.until(lambda s: drive.command == 250_000, backend=b)
+        wire.until(lambda s: next(ticks, None) is None, backend=b)
+        assert b.sample.status[STATE] == OK and b.counters().get("drive.reconnects", 0) == 0
+        assert (echo.count > 1000) is echoes
+        line.send(line.adapter.encode([frame]))
+        wire.until(lambda s: s.status[STATE] == ERROR and drive.command == 0, backend=b)
+        assert message in b.problem("amplifier_state")
+        wire.enable = False
+        wire.until(lambda s: s.status[STATE] == OK, backend=b)  # connected again
+    finally:
+        b.close()

@@ -435,3 +435,50 @@ def test_a_counter_does_not_replace_times_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r":2: column 'Elapsed': '0:00:00:00.5' is no time .*'Scan'"):
         read(tmp_path, table("Scan,Elapsed,T", *rows))
     assert read(tmp_path, table("Scan,Elapsed,T", *rows), time="Scan").t.tolist() == [0, 1, 2]
+
+
+FACTORS = {
+    "time (0.1 ms)": "time \\(0.1 ms\\)' counts in steps",
+    "t [10 ms]": "t \\[10 ms\\]' counts in steps",
+    "time_10ms": "counts in steps",
+    "Zeit [1/100 s]": "counts in steps",
+    "t (10^-3 s)": "no other that is a time for sure",
+    "time [ticks]": "no unit of time that is known",
+}
+
+
+@pytest.mark.parametrize("header", FACTORS)
+def test_a_time_whose_unit_has_a_factor_is_refused(tmp_path, header):
+    """`0.1 ms` was read as ms, `10 ms` as s."""
+    path = tmp_path / "run.csv"
+    path.write_text(f"{header},U\n" + "".join(f"{i},{20 + i}\n" for i in range(6)))
+    with pytest.raises(InputError, match=FACTORS[header]):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["t,T [0.1 degC]\n0,200\n1,201\n2,202\n", "t,T\ns,0.1 degC\n0,200\n1,201\n2,202\n"]
+)
+def test_a_factor_stays_in_the_unit_which_no_plant_takes(tmp_path, text):
+    """The column was called `0.1 degC`, in tesla; below a header the unit vanished."""
+    (tmp_path / "run.csv").write_text(text)
+    assert read_recording(tmp_path / "run.csv").units["T"] == "0.1 degC"
+    with pytest.raises(ValueError, match="scaling factor"):
+        conversion("0.1 degC", "degC")
+
+
+def test_milliseconds_of_an_epoch_in_a_column_t_are_no_seconds(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t,T\n" + "".join(f"{1773480000000 + 100 * i},{20 + i}\n" for i in range(6)))
+    np.testing.assert_allclose(read_recording(path).t, 0.1 * np.arange(6))
+
+
+@pytest.mark.parametrize(
+    "rows,note",
+    [("{i};1.{i}00;20\n", "1.000 read with a decimal point"), ("{i},5;1.{i}00\n", "'P': 1.000 read as 1000")],
+)
+def test_a_point_that_may_part_thousands_is_noted(tmp_path, rows, note):
+    path = tmp_path / "run.csv"
+    header = "Zeit;P;T\n" if rows.count(";") == 2 else "Zeit;P\n"
+    path.write_text(header + "".join(rows.format(i=i) for i in range(6)))
+    assert any(note in n for n in read_recording(path).notes)

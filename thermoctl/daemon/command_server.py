@@ -28,7 +28,7 @@ from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.control_socket import settled
 from thermoctl.daemon.reload import jumps
 from thermoctl.daemon.tick import arrival
-from thermoctl.daemon.tick.assemble import law_parameters
+from thermoctl.daemon.tick.assemble import in_force, law_parameters
 from thermoctl.daemon.tick.loop import RELOAD
 from thermoctl.daemon.tick.shared import TRIAL, Shared
 from thermoctl.files.yamlfile import InputError
@@ -59,7 +59,9 @@ class Commands:
         reload_settings: Callable[[Settings, Settings], tuple[Settings, Parameters, list[str], list[str]]],
         log: Callable[..., None],
     ):
-        self.shared, self.settings, self.started = shared, settings, settings
+        self.shared, self.started = shared, settings
+        # This process may replace one that was killed after a reload.
+        self.settings = in_force(settings, shared.parameters.get())
         self.reload_settings, self.log = reload_settings, log
         self.expected_hz = arrival.expected_hz(settings)
         self.can_drive = can_drive(settings)

@@ -203,10 +203,10 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
     Its files hold every option of the configuration in force, and the law's metadata.
     """
     from thermoctl.configuration.settings import POINTS, effective
-    from thermoctl.daemon.tick.assemble import compensator, law_parameters, rig_identity
+    from thermoctl.daemon.tick.assemble import compensator, in_force, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter
 
-    config, rig = effective(settings), rig_identity(settings)
+    rig = rig_identity(settings)
     tell = Unsaved(shared, "recording", log)
 
     def open_writer(law: str) -> RecordingWriter:
@@ -214,7 +214,7 @@ def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) 
         metadata = {
             "rig": rig,
             "run": shared.run,
-            "config": config,
+            "config": effective(in_force(settings, shared.parameters.get())),
             "law": law,
             "faults": json.dumps(faults.NAMES),
             POINTS: settings.channels.text(),

@@ -8,6 +8,7 @@ cdef enum:
     MAX_MESSAGE = 64            # the longest Lawicel message has 30 bytes
     MAX_FRAMES = 1024           # of a read: the shortest Lawicel frame has 6 bytes
     MAX_QUEUED = 32             # frames of one send
+    MAX_ECHOES = 256            # own frames that may still come back from an adapter
     MAX_PENDING = 4096  # unsent bytes of a line that takes none; with more, it counts as lost
     EXTENDED_FLAG = 1 << 31      # of a can_id: 29 bits (as in the kernel's struct can_frame)
 
@@ -75,6 +76,12 @@ cdef class CanPort:
     cdef int _count, _queued
     cdef Frame[MAX_QUEUED] _out
     cdef Frame[MAX_FRAMES] _own
+    cdef Frame[MAX_ECHOES] _sent
+    cdef long _sent_count, _echoed
+    cdef bint _drops
+
+    cdef void _note_sent(self) noexcept
+    cdef bint _is_echo(self, const Frame *frame) noexcept
 
     cpdef int take(self) except -1
     cpdef int flush(self) except -1

@@ -542,8 +542,43 @@ cdef class CanPort:
         if self._count == MAX_FRAMES or len(data) > 8:
             return False
         self._own[self._count] = Frame(can_id, <int>len(data), _whole(data))
+        if self._is_echo(&self._own[self._count]):
+            return False
         self._count += 1
         return True
+
+    def drop_echoes(self) -> None:
+        """Drop frames that the adapter hands back (CiA 402: no drive answers with the frame that it took)."""
+        self._drops = True
+
+    cdef void _note_sent(self) noexcept:
+        """Remember the queued frames, and empty the queue."""
+        cdef int k
+        for k in range(self._queued):
+            self._sent[self._sent_count % MAX_ECHOES] = self._out[k]
+            self._sent_count += 1
+        self._queued = 0
+
+    cdef bint _is_echo(self, const Frame *frame) noexcept:
+        """Return whether a frame is one that we sent and the adapter hands back; any other is of the bus.
+
+        An adapter hands back all frames or none, in order. If the first frame sent does not come back,
+        none is an echo: a heartbeat of another master equals ours."""
+        cdef long k, first = self._echoed
+        cdef long end = self._sent_count if first else min(self._sent_count, 1)
+        cdef Frame *sent
+        if not self._drops:
+            return False
+        if self._sent_count > first + MAX_ECHOES:
+            if not first:
+                return False
+            first = self._sent_count - MAX_ECHOES
+        for k in range(first, end):
+            sent = &self._sent[k % MAX_ECHOES]
+            if sent.can_id == frame.can_id and sent.size == frame.size and sent.data == frame.data:
+                self._echoed = k + 1
+                return True
+        return False
 
     def begin(self) -> None:
         """Forget the received frames (for subclasses in Python)."""
@@ -552,7 +587,7 @@ cdef class CanPort:
     def queued(self) -> list:
         """Return the queued frames, (id, data), and empty the queue (for subclasses in Python)."""
         found = [_pair(&self._out[k]) for k in range(self._queued)]
-        self._queued = 0
+        self._note_sent()
         return found
 
     cpdef int queue(self, uint32_t can_id, uint64_t data, int size) except -1:
@@ -600,17 +635,22 @@ cdef class SlcanLine(CanPort):
 
     cpdef int take(self) except -1:
         cdef uint8_t[MAX_READ] data
-        cdef int got = _read(self.fd, data, MAX_READ)
+        cdef int k, kept = 0, got = _read(self.fd, data, MAX_READ)
         self.parser._count = 0
         self.parser._feed(data, got)
-        return self.parser._count
+        for k in range(self.parser._count):
+            if not self._is_echo(&self.parser._frames[k]):
+                self.parser._frames[kept] = self.parser._frames[k]
+                kept += 1
+        self.parser._count = kept
+        return kept
 
     cpdef int flush(self) except -1:
         cdef int k, done
         for k in range(self._queued):
             self._unsent_size += _encode(self._unsent + self._unsent_size, self._out[k].can_id,
                                          <const uint8_t *>&self._out[k].data, self._out[k].size)
-        self._queued = 0
+        self._note_sent()
         done = <int>c_write(self.fd, self._unsent, self._unsent_size)
         if done < 0:
             if c_errno != EAGAIN and c_errno != EINTR:

@@ -404,6 +404,10 @@ class SharedPort(CanPort):
             taken += self.deliver(can_id, data)
         return taken
 
+    def drop_echoes(self) -> None:
+        """Drop frames that the adapter hands back, for every user of the adapter."""
+        self.hub.adapter.drop_echoes()
+
     def long_frames(self) -> list[tuple[int, bytes]]:
         """Return the CAN FD frames that have arrived, and forget them."""
         found = list(self.long_inbox)

@@ -12,7 +12,7 @@ import logging
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,13 @@ _TYPE = re.compile(r"\s*SIG_VALTYPE_\s+(\d+)\s+(\S+?)\s*:?\s*([0-3])\s*;")
 _EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
 _FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
 _FORMAT_OF = re.compile(r'\s*BA_\s+"VFrameFormat"\s+BO_\s+(\d+)\s+([^;]*);')
+_KIND = re.compile(
+    r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE
+)  # a line without which numbers are wrong
+_PAGE = re.compile(r"m\d")
 _WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
+_WORDS = re.compile(r'\s*VAL_\s+(\d+)\s+\S+(?:\s+-?\d+\s+"[^"]*")+\s*;\s*')
+_OF_A_MESSAGE = _TYPE, _EXTENDED_MUX, _FORMAT_OF, _WORDS
 _J1939 = re.compile(r'^\s*BA_\s+"ProtocolType"\s+"J1939', re.MULTILINE)
 _LINE = re.compile(r"at line (\d+)")
 
@@ -99,7 +105,25 @@ def load_dbc(path: Path) -> DbcFile:
     if _J1939.search(text) and "VFrameFormat" not in text:
         for message in blocks.database.messages:
             message.protocol = "j1939"
-    return blocks
+    return replace(blocks, faults={**blocks.faults, **_misread(text, blocks.database)})
+
+
+def _misread(text: str, database: Database) -> dict[str, str]:
+    """Return the signals whose kind or page cantools passes over, and why.
+
+    It does so at the end of a file that was cut off. Where several multiplexers, or none, could select a
+    page, it takes the signal from every page."""
+    faults: dict[str, str] = {}
+    for block in _blocks(text, faults)[0]:
+        for line, signal in block.lines[1:]:
+            match = _SIGNAL.match(signal)
+            if match and _PAGE.match(match["mux"] or ""):
+                why = "no multiplexer, or several, select its page: add SG_MUL_VAL_ lines"
+                faults.setdefault(f"{block.name}.{match['name']}", f"line {line}: {why}")
+    read = {
+        f"{m.name}.{s.name}" for m in database.messages for s in m.signals if s.is_float or s.multiplexer_ids
+    }
+    return {name: why for name, why in faults.items() if name not in read}
 
 
 def _first_line(error: Exception) -> str:
@@ -121,11 +145,11 @@ def _doubled(messages: Iterator[Message]) -> dict[str, str]:
 def _by_message(path: Path, text: str, reason: str) -> DbcFile:
     from cantools.database.can import Database
 
-    blocks, attributes, remarks = _blocks(text)
+    faults: dict[str, str] = {}
+    blocks, attributes, remarks = _blocks(text, faults)
     if not blocks:
         raise ValueError(f"{NO_MESSAGES}; {reason}")
     messages: list[Message] = []
-    faults: dict[str, str] = {}
     for block in blocks:
         message = _message(block, attributes, faults, remarks)
         if message is not None:
@@ -160,8 +184,10 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
         yield number, line
 
 
-def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
-    """Return the messages' blocks, the lines that declare VFrameFormat, and remarks on the rest."""
+def _blocks(text: str, faults: dict[str, str]) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
+    """Return the messages' blocks, the lines that declare VFrameFormat, and remarks on the rest.
+
+    A signal whose kind or page stands in a line that cannot be read is one of `faults`."""
     blocks: list[_Block] = []
     attributes: list[str] = []
     remarks: list[tuple[int, str]] = []
@@ -182,10 +208,24 @@ def _blocks(text: str) -> tuple[list[_Block], list[str], list[tuple[int, str]]]:
             remarks.append((number, f"VAL_ {begin[1]} {begin[2]}: there is no such signal, ignored"))
         elif _FORMAT.match(line):
             attributes.append(line.strip())
-        elif match := next(filter(None, (p.match(line) for p in (_TYPE, _EXTENDED_MUX, _FORMAT_OF))), None):
-            for one in of[int(match[1])]:
+        elif match := next(filter(None, (p.match(line) for p in _OF_A_MESSAGE)), None):
+            for one in of[int(match[1])] or of[int(match[1]) ^ EXTENDED]:
                 one.more.append(line.strip())
+        else:
+            _unread(number, line, blocks, faults, remarks)
     return blocks, attributes, remarks
+
+
+def _unread(
+    number: int, line: str, blocks: list[_Block], faults: dict[str, str], remarks: list[tuple[int, str]]
+) -> None:
+    """Leave out the signals that a line names whose kind or page it should state."""
+    words = set(re.findall(r"\w+", line)) if _KIND.match(line) else ()
+    for block in blocks:
+        for _, text in block.lines:
+            if (begin := _BEGINS_SIGNAL.match(text)) and begin[1] in words:
+                why = f"{line.strip()[:60]}: no line of the format"
+                _left_out(number, f"{block.name}.{begin[1]}", why, faults, remarks)
 
 
 def _begun(line: int, text: str, remarks: list[tuple[int, str]]) -> _Block | None:

@@ -103,6 +103,7 @@ class Cia402Device(Device):
     def connect(self) -> None:
         """Open the port, set the drive up and start its node; the drive stays disabled."""
         port = open_can(self.binding.port, self._ids, self.binding.shared)
+        port.drop_echoes()
         try:
             sdo = Sdo(port, self._node, self._spec.sdo_timeout_s)
             self._fault_code = set_up(sdo, self._spec, self._formats, self.binding.port)

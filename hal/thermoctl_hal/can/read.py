@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.cia402 import OBJECT_TYPES, START_UP, read_object_name
@@ -27,6 +29,10 @@ from thermoctl_hal.can.keys import CAN
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Signal
 
+# Words of a file's value table that name a raw number without a reading.
+_NO_VALUE = re.compile(
+    r"(?i)(SNA|(signal|value)?[ _]?(not[ _]?available|invalid)|no[ _](value|data|signal))[ _]*"
+)
 # A value belongs to a raw number if it is this close to the number's value, in steps of the signal.
 NEAR_RAW = 0.01
 
@@ -59,6 +65,8 @@ def read_signal(s: Section, spec: BusSpec) -> DbcSource:
         k["invalid"].end()
     signal = _signal_of(s, dbc, message)
     sentinels = tuple(_raw_sentinel(n, signal) for n in k["sentinels"] or ())
+    choices: Mapping[Any, object] = {} if signal.is_float else signal.choices or {}
+    sentinels += tuple(float(raw) for raw, word in choices.items() if _NO_VALUE.fullmatch(str(word)))
     return DbcSource(message, signal.name, invalid, sentinels)
 
 

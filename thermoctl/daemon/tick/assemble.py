@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import grp
 import zlib
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,28 @@ def law_parameters(settings: Settings) -> Parameters:
         for f in fields(Parameters)
     }
     return Parameters(**taken)
+
+
+def in_force(settings: Settings, numbers: np.ndarray | None) -> Settings:
+    """Return the settings with the options of the packed parameters of a reload or a trial.
+
+    None: the settings as they are."""
+    if numbers is None:
+        return settings
+    taken = vars(Parameters.unpack(numbers))
+    taken |= {"enable": taken["compensate"]}
+    sections = {}
+    for name in ("control", "compensation", "protection"):
+        old = vars(getattr(settings, name))
+        new = {n: taken[n] for n in old if n in taken}
+        for n in new.keys() & BY_CHANNEL.keys():
+            pairs = zip(settings.channels.names, new[n].tolist(), strict=True)
+            by_name = {c: x for c, x in pairs if x != BY_CHANNEL[n] or (n != "required" and c in old[n])}
+            same = n == "required" and by_name.keys() == set(old[n])
+            new[n] = old[n] if same else tuple(by_name) if n == "required" else by_name
+        new |= {n: type(old[n])(x) for n, x in new.items() if isinstance(old[n], bool | int)}
+        sections[name] = replace(getattr(settings, name), **new)
+    return replace(settings, **sections)
 
 
 def _by_channel(channels: Channels, given: Any, default: float, where: str) -> np.ndarray:

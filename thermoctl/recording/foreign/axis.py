@@ -19,7 +19,15 @@ from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.parts import joined
 from thermoctl.recording.foreign.sheet import Cells, Sheet
-from thermoctl.recording.foreign.units import COUNTED, NAMED, is_generic, known, named, unit_of_time
+from thermoctl.recording.foreign.units import (
+    COUNTED,
+    NAMED,
+    has_factor,
+    is_generic,
+    known,
+    named,
+    unit_of_time,
+)
 
 KINDS = {
     "date and time": 60,
@@ -105,7 +113,8 @@ _MINUTES = re.compile(r"(?i)(?<![:\w])m+(?:in\w*)?:s")  # a header such as "Time
 def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Seconds:
     """Return a column as seconds. Raises ClockError for one that cannot be a time.
 
-    `is_time`: see `unit_of_time`."""
+    `is_time`: see `unit_of_time`. A unit with a factor is refused, and one that is none where no person
+    named the column."""
     if isinstance(cells, np.ndarray):
         if cells.dtype.kind in "mM":
             return clock.from_stamps(cells)
@@ -117,7 +126,15 @@ def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Se
             t = np.full(len(cells), np.nan)
             t[there] = seconds.t
             return replace(seconds, t=t)
-        return clock.from_numbers(cells, unit_of_time(name, unit, is_time), named(name) > 0)
+        stated, header = unit_of_time(name, unit, is_time), f"{name} [{unit}]" if unit else name
+        seconds = clock.from_numbers(cells, stated, named(name) > 0)
+        if seconds.kind != "epoch" and has_factor(header) and (stated or named(name) > 0):
+            raise ClockError(
+                0, f"'{header}' counts in steps; write it in s, or say --time 0.1s for even rows"
+            )
+        if seconds.kind == "bare" and unit and not is_time and named(name) > 0 and not known(unit):
+            raise ClockError(0, f"'{unit}' is no unit of time that is known; if it is s, say --time '{name}'")
+        return seconds
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
     minutes = clock.from_minutes(cells) if _MINUTES.search(f"{name} {unit or ''}") else None

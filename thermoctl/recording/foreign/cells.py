@@ -40,6 +40,7 @@ _READINGS = {
     ".": rf"^(\d+|[1-9]\d{{0,2}}(,\d{{3}})+|[1-9]\d{{0,2}}([{_GROUP}]\d{{3}})+)?(\.\d*)?$",
     ",": rf"^(\d+|[1-9]\d{{0,2}}(\.\d{{3}})+|[1-9]\d{{0,2}}([{_GROUP}]\d{{3}})+)?(,\d*)?$",
 }
+_UNGROUPED = str.maketrans("", "", ".,")
 FEW_WORDS = 3  # up to so many different words among numbers are a status; more are remarks
 
 
@@ -184,7 +185,12 @@ def numbers(
     body = parts.field("body")
     if not any(pc.any(pc.match_substring_regex(body, p)).as_py() for p in _READINGS.values()):
         return None  # identities such as 345_9356_33_6
-    values = _valued(name, parts, empty, decimal)
+    values, grouped = _valued(parts, empty, decimal)
+    if grouped:
+        note = (
+            *note,
+            f"'{name}': {grouped} read as {grouped.translate(_UNGROUPED)}, with a separator of thousands",
+        )
     return with_units(name, values, unit, empty, note)
 
 
@@ -224,7 +230,8 @@ def _refuse(name: str, tidy: pa.Array, wrong: np.ndarray, count: int) -> None:
     )
 
 
-def _valued(name: str, parts: pa.Array, empty: np.ndarray, decimal: str | None) -> np.ndarray:
+def _valued(parts: pa.Array, empty: np.ndarray, decimal: str | None) -> tuple[np.ndarray, str]:
+    """Return the numbers, and one that only the file's decimal sign shows to have thousands; '' for none."""
     body = pc.if_else(pa.array(empty), pa.scalar(None, pa.string()), parts.field("body"))
     fits = {s: pc.fill_null(pc.match_substring_regex(body, p), True) for s, p in _READINGS.items()}
     whole = [s for s, m in fits.items() if pc.all(m).as_py()]
@@ -246,6 +253,8 @@ def _valued(name: str, parts: pa.Array, empty: np.ndarray, decimal: str | None) 
             )
         chosen = "."
     sign = chosen
+    apart = pc.drop_null(body.filter(pc.match_substring(body, "," if sign == "." else ".")))
+    grouped = apart[0].as_py() if len(whole) > 1 and len(apart) else ""
     body = pc.replace_substring_regex(body, f"[{_GROUP}{'.' if sign == ',' else ','}]", "")
     body = pc.replace_substring(body, sign, ".")
     # Without the exponent's letter a Fortran double is a float; an empty group gives an empty text.
@@ -262,7 +271,7 @@ def _valued(name: str, parts: pa.Array, empty: np.ndarray, decimal: str | None) 
         pc.fill_null(pc.not_equal(parts.field("open"), ""), False),
     ):
         signs[pc.fill_null(minus, False).to_numpy(zero_copy_only=False)] *= -1
-    return values * signs
+    return values * signs, grouped
 
 
 def with_units(

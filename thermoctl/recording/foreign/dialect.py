@@ -20,6 +20,7 @@ from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.facts import aligned, facts_of, take_below
 from thermoctl.recording.foreign.units import (
     WORDS,
+    has_factor,
     known,
     named,
     spelled,
@@ -200,6 +201,8 @@ def find_dialect(path: Path, text: str) -> Dialect:
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
     facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
     decimal = _decimal(data, separator)
+    if decimal == "." and separator == ";" and (parted := _perhaps_thousands(data)):
+        notes.append(f"{parted} read with a decimal point (if it parts thousands: --decimal ,)")
     if separator != "," and width > 1:
         notes.append(f"separator {shown(separator)}" + (", decimal comma" if decimal == "," else ""))
     return Dialect(
@@ -371,7 +374,7 @@ def _header(
     for number, row in below:
         if not _is_kinds(row):
             stated = (spelled(_bare(c), n) for c, n in zip(_widened(row, width, data), names, strict=True))
-            units |= {n: u for n, u in zip(names, stated, strict=True) if u and known(u)}
+            units |= {n: u for n, u in zip(names, stated, strict=True) if u and (known(u) or has_factor(u))}
             notes.append(f"line {number} read as units")
             take_below(lines_of[-1][1], row, facts)
     units |= aligned(facts, names, units)
@@ -551,6 +554,12 @@ def _parts_thousands(column: tuple[str, ...]) -> bool:
     whole = [c for c in column if re.fullmatch(r"[-+]?\d{1,3}", c)]
     others = [c for c in column if not is_missing(c) and c not in parted and c not in whole]
     return bool(parted and whole) and not others and any(c.endswith("0") for c in parted)
+
+
+def _perhaps_thousands(data: list[list[str]]) -> str:
+    """Return a number such as 1.200 where every point in the sample may part thousands; '' else."""
+    pointed = [c for row in data for c in row if _DECIMALS.match(c)]
+    return pointed[0] if all(re.match(r"[-+]?[1-9]\d{0,2}\.\d{3}$", c) for c in pointed) and pointed else ""
 
 
 def _numeric(names: tuple[str, ...], data: list[list[str]]) -> frozenset[str]:

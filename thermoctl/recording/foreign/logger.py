@@ -48,7 +48,8 @@ def read_recording(
         if _is_ours(path, said):
             try:
                 table = files.read_table(path)
-                if not any(split_unit(n)[1] for n in table.columns) and not has_no_readings(table.columns):
+                with_units = any(split_unit(n)[1] for n in table.columns)
+                if not with_units and not has_no_readings(table.columns) and np.abs(table.t).max() < EPOCH_S:
                     said.trace.extend(
                         ("format: " + kind_of(path), "time: 't': a table of numbers with a time in seconds")
                     )
@@ -66,6 +67,7 @@ def read_recording(
     return _renamed(table, columns or {})
 
 
+EPOCH_S = 1e8  # three years: larger times are milliseconds of an epoch, or seconds of one with its date
 _TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", "")
 
 

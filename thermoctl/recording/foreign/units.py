@@ -27,6 +27,8 @@ _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*
 _LAST = re.compile(
     r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$"
 )  # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope
+# A number that no letter precedes, and the word behind it.
+_FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
 _SPELLED = {word: unit for unit, words in SPELLINGS.items() for word in words.split(" | ")}
 
 
@@ -67,6 +69,12 @@ def known(unit: str) -> bool:
     return written is not None and bool(_UNIT.match(written))
 
 
+def has_factor(unit: str) -> bool:
+    """Return whether a unit of time or another states a factor: `0.1 ms`, `x10 W`, `1/100 s`, `1e3 W`."""
+    found = _FACTOR.findall(unit)
+    return not known(unit) and any(time_unit(word) or known(word) for word in found)
+
+
 def split_unit(header: str) -> tuple[str, str | None]:
     """Return name and unit of `T_block [degC]`, `T_block (degC)`, `T_block / °C`; None for no unit."""
     text = header.strip()
@@ -75,7 +83,7 @@ def split_unit(header: str) -> tuple[str, str | None]:
         return text, None
     name, square, bracket, slash = match.groups()
     unit = (square if square is not None else bracket if bracket is not None else slash).strip()
-    if square is not None and known(name) and not known(unit):  # °C [Kanal 1] of Testo
+    if square is not None and known(name) and not (known(unit) or has_factor(unit)):  # °C [Kanal 1] of Testo
         return unit, spelled(name, unit)
     if unit == "h" and re.fullmatch(r"[A-Z]\w?\(h\)", text):  # G(h) of PVGIS: on the horizontal plane
         return text, None
