@@ -284,7 +284,7 @@ def propose(
             enough = (t for t in trials if t.bits >= ENOUGH * most)
             best = max(enough, key=lambda t: t.bits / t.excitation.duration_s)
             if best.bits < LEAST_BITS and diagnosis.law:
-                return None  # forms of one law that no experiment tells apart serve alike
+                return None  # no experiment tells these forms of one law apart
             return _entry(comparison, best, len(trials)), best.excitation
     return None
 

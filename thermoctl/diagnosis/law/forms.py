@@ -234,7 +234,7 @@ def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np
 
 
 def of_plant(e: Expr) -> Expr:
-    """Return an expression with the plant's names marked, so that an effect's symbols (air, s1) are others."""
+    """Return an expression with the plant's names marked: an effect has symbols such as air and s1, too."""
     return ex.fill(e, {n: name(MARK + n) for n in ex.names(e)})
 
 

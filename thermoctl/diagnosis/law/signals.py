@@ -26,7 +26,7 @@ class Place:
 
     - flow: into the node `target` from outside, or from the node `source`
     - storage: of the node `target`
-    - conversion: a flow that the plant file writes as several flows in proportion, `flows`. For each unit into
+    - conversion: several flows of the plant file that are always in proportion, `flows`. For each unit into
       the target a share, an expression of parameters, goes into other nodes: `shares`"""
 
     target: str
@@ -129,7 +129,7 @@ def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:
 
 
 def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
-    """Return b / a if this is a parameter, one over one, or a number, whatever all values are; else None."""
+    """Return b / a if it is a parameter, one over a parameter, or a number for all values; else None."""
     read = sorted(ex.names(a) | ex.names(b))
     drawn = np.random.default_rng(0).uniform(0.5, 2.0, (len(read), DRAWS))
     values = dict(zip(read, drawn, strict=True))
