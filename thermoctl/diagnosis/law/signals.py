@@ -83,7 +83,7 @@ class Signal:
 
 
 def places(rig: Rig) -> list[Place]:
-    """Return the places of laws: flows into nodes, flows between connected nodes, and storages.
+    """Return the places of laws: flows into and between nodes, storages, and conversions.
 
     A position is no such node. A storage of 1 is a definition: dn/dt is the sum of the flows."""
     positions = set(rig.pairs.values())
