@@ -335,3 +335,6 @@ def test_an_effect_that_ends_says_when(end, text):
     times = {"T0": {"value": 499.5, "sd": 1.0, "unit": "s"}, "T1": {"value": 899.5, "sd": 1.0, "unit": "s"}}
     lamp = {"effect": "heat_source", "where": "two", "when": [[499.5, end]], "parameters": times}
     assert name(lamp) == f"heat source {text} at two"
+    assert name({**lamp, "recording": "day2", "lasts": False}) == f"heat source in day2 {text} at two"
+    stays = text.replace(" s on", " s of day2 on") if " on" in text else f"in day2 {text}"
+    assert name({**lamp, "recording": "day2", "lasts": True}) == f"heat source {stays} at two"

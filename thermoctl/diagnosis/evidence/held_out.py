@@ -112,7 +112,22 @@ def rms_of(errors: Sequence[np.ndarray], outputs: Sequence[str]) -> dict[str, fl
 def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Return the free-run errors (N, outputs) on a recording set aside, its initial states fitted.
 
-    NaN where it cannot be simulated."""
+    An event in one of the other recordings may be past or not yet there: the better one is taken. NaN where
+    it cannot be simulated."""
+    clocks = [
+        p for q, p in plant.parameters.items() if q not in case.plant.parameters and p.values and not p.range
+    ]
+    ways = [plant]
+    for p in clocks:
+        others = dataclasses.replace(p, value=-p.value)
+        ways += [dataclasses.replace(w, parameters={**w.parameters, p.name: others}) for w in ways]
+    errors = [_errors_aside(case, w, table) for w in ways]
+    sigma = np.array([n.sigma for n in case.noise])
+    return min(errors, key=lambda e: float(np.nansum((e / sigma) ** 2)) if np.isfinite(e).any() else np.inf)
+
+
+def _errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
+    """Return the errors on a recording set aside, as `errors_aside`, of a plant with its events."""
     from scipy.optimize import least_squares  # slow to load, and only starts of other recordings need it
 
     model = compile_plant(plant)

@@ -14,11 +14,13 @@ from thermoctl.diagnosis.limits import Thresholds
 def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thresholds) -> float:
     """Return the log prior odds of a hypothesis against no effect.
 
-    The odds are shared equally among the entries, and each entry's among its places. A law states its own."""
+    The odds are shared equally among the entries, each entry's among its places, and an event's among the
+    clocks that it may have (`candidates`). A law states its own."""
     total = sum(e.log_odds or 0.0 for e in effects)
     for e in (e for e in effects if e.log_odds is None):
         c = e.candidate
         share = max(len(where), 1) * len(where.get(c.effect.name, {c.place.where}))
+        share *= max(2 * len(c.begins) - 3, 1)
         total += np.log(limits.missing / (1 - limits.missing) / share)
         total += rare(c.effect, bool(c.place.input)) * np.log(limits.rare)
     return float(total)

@@ -27,7 +27,8 @@ LONGEST = 78  # characters of a node's name
 class Candidate:
     """An effect at a place, in one of its variants, with one choice of the signals that it needs.
 
-    `symbols`: these signals. `label`: of the variant and the choice."""
+    `symbols`: these signals. `label`: of variant, choice and clock. `begins`: by recording, when it begins on
+    the effect's clock, s ("" is any other one); empty where that clock begins with each."""
 
     effect: Effect
     place: Place
@@ -35,6 +36,7 @@ class Candidate:
     variant: int = 0
     symbols: Mapping[str, Expr] = field(default_factory=dict)
     label: str = ""
+    begins: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def key(self) -> tuple[str, str]:
@@ -149,6 +151,10 @@ class _Builder:
         # a parameter, since a bare number of 1 s would vanish from a product, and its unit with it
         sample = Parameter(self.c.own("sample"), float(f"{self.rig.sample:.6g}"), "s")
         self.parameters[sample.name], symbols["sample"] = sample, name(sample.name)
+        if begins := self.c.begins:
+            values = {r: v for r, v in begins.items() if r}
+            begin = Parameter(self.c.own("begin"), begins[""], "s", None, True, values)
+            self.parameters[begin.name], symbols["t"] = begin, ex.add(name("t"), name(begin.name))
         return symbols
 
     def _parameter(self, p: EffectParameter, value: float, low: float, high: float) -> Parameter:

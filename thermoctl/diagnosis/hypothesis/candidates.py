@@ -13,6 +13,8 @@ from thermoctl.plant.expression import Expr, name
 
 Key = tuple[str, str]  # (effect, where)
 Keys = frozenset[Key]  # the effects of a hypothesis
+EVENTS = {"onsets", "windows"}  # shapes that happen at one moment
+FAR = 5.0  # durations of a recording between it and one that begins before or after an event
 
 
 def spoken(keys: Iterable[Key]) -> list[str]:
@@ -51,8 +53,28 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
                 continue
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(_choices(rig, effect, place)):
-                    candidate = Candidate(here, place, rig, variant, choice, f"{variant}{k}")
-                    if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
-                        continue  # without a held input it would equal the variant without `straight`
-                    out.append(candidate)
+                    for which, begins in _clocks(rig, effect).items():
+                        label = f"{variant}{k}{which}"
+                        candidate = Candidate(here, place, rig, variant, choice, label, begins)
+                        if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
+                            continue  # without a held input it would equal the variant without `straight`
+                        out.append(candidate)
     return out
+
+
+def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
+    """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
+
+    The event is at the same time of each, or at a time of one that it changes alone or with all later ones."""
+    clocks: dict[str, dict[str, float]] = {"": {}}
+    names = [d.name for d in rig.drives]
+    in_pieces = any(d.x0 is not None for d in rig.drives)
+    if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()):
+        return clocks
+    before, after = -FAR * rig.duration, FAR * rig.duration
+    for k, own in enumerate(names):
+        past = {n: before if j < k else after for j, n in enumerate([*names, ""])}
+        clocks[f" from {own}"] = past | {own: 0.0}
+    for own in names[:-1]:
+        clocks[f" in {own}"] = dict.fromkeys([*names, ""], before) | {own: 0.0}
+    return clocks

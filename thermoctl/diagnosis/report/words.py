@@ -85,7 +85,11 @@ def name(finding: Result) -> str:
     if finding.get("when"):
         start, end = finding["when"][0]
         ends = any(p["unit"] == "s" and abs(p["value"] - end) <= 1e-6 * abs(end) for p in parameters)
-        text += f" from {start:.4g} s" + (f" to {end:.4g} s" if ends else " on")
+        run, stays = finding.get("recording"), finding.get("lasts") and not ends
+        text += f" in {run}" if run and not stays else ""
+        text += (
+            f" from {start:.4g} s" + (f" of {run}" if stays else "") + (f" to {end:.4g} s" if ends else " on")
+        )
     return f"{text} at {finding['where']}"
 
 

@@ -49,7 +49,7 @@ class Overlay:
 
     def __init__(self, base: Plant, extended: Plant):
         self.base, self.states = base, list(base.nodes)
-        self.start = {k: p.value for k, p in extended.parameters.items() if k not in base.parameters}
+        self.own = [p for k, p in extended.parameters.items() if k not in base.parameters]
         self.new = [(n, _net(extended, k)) for k, n in extended.nodes.items() if k not in base.nodes]
         self.flows = [
             (f, old)
@@ -74,7 +74,8 @@ class Overlay:
 
         `values`: of the extension's parameters; the others have those of the extended plant."""
         base = self.base
-        extra: dict[str, np.ndarray | float] = {**self.start, **values}
+        here = {p.name: p.values.get(trajectory.drive.name, p.value) for p in self.own}
+        extra: dict[str, np.ndarray | float] = {**here, **values}
         for n, net in self.new:
             extra[n.name] = _new_node(n, net, extra, trajectory)
         nets: dict[str, np.ndarray] = {}

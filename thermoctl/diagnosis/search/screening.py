@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.levels import PRESENT, over_noise
-from thermoctl.diagnosis.hypothesis.candidates import candidates
+from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.fine import above, fine
@@ -23,6 +24,7 @@ from thermoctl.diagnosis.search.sketch import likeliest
 LOUD = 2.0  # residual's rms over the noise, from which energy is the better guide
 PROMISED = 30  # number of directions whose gain in log likelihood is predicted
 ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
+CLOCKS = 2  # largest number of choices of the recordings in which an event happens, at one place
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,12 @@ def places(case: Case) -> dict[str, set[str]]:
 
 def _foremost(metric: Metric, rig: Rig, found: list[Direction]) -> list[Direction]:
     """Return the directions whose gain is predicted, events at their best times: the grid's are too rough."""
-    return [sharpened(metric, rig, d) for d in foremost(found, ROOM * PLACES_EACH)[:PROMISED]]
+    first, clocks = list[Direction](), Counter[Key]()
+    for d in foremost(found, ROOM * PLACES_EACH):
+        clocks[d.candidate.key] += bool(d.candidate.begins)
+        if not d.candidate.begins or clocks[d.candidate.key] <= CLOCKS:
+            first.append(d)
+    return [sharpened(metric, rig, d) for d in first[:PROMISED]]
 
 
 def _promise(metric: Metric, d: Direction) -> float:

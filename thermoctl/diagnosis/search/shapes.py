@@ -59,7 +59,8 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> G
     holds `longest`, the longest period that repeats in the recordings. A level holds `least` and `most`, the
     ends of its prior."""
     if kind in ("onsets", "times", "lags", "delays"):
-        return _times(kind, candidate.rig.duration, candidate.rig.sample)
+        between = [{"onset": 0.0}] if kind == "onsets" and candidate.begins else []
+        return between + _times(kind, candidate.rig.duration, candidate.rig.sample)
     if kind in ("periods", "distances"):
         return _positions(kind, candidate, runs)
     if kind in ("speeds", "creep_speeds"):
