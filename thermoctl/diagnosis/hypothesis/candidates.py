@@ -65,7 +65,7 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
 def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
     """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
 
-    The event is at the same time of each, or at a time of one that it changes alone or with all later ones."""
+    The event is at the same time of each, or at a time of one that it changes alone or with later ones."""
     clocks: dict[str, dict[str, float]] = {"": {}}
     names = [d.name for d in rig.drives]
     in_pieces = any(d.x0 is not None for d in rig.drives)
