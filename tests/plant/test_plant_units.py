@@ -35,6 +35,7 @@ def plant(**change):
         {"y": "T * 1e6 + v * 2", "y_unit": "um"},  # bare numbers take any dimension
         {"loss": "G * (T + 273.15 - air)"},
         {"loss": "G * (T - air) * tanh(v / 2e-4)"},
+        {"loss": "G * (T - air) * tanh(v / 1.0)"},
         {"loss": "G * (T - air) * (v > 0.1)"},
         {"G": "kW/K", "heat": "mW"},  # prefixes are alike
         {"G": "J/s/K"},

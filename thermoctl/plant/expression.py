@@ -153,6 +153,13 @@ def div(a: Expr, b: Expr) -> Expr:
     return make("/", a, b)
 
 
+def _product(op: str, a: Expr, b: Expr, by_one: bool) -> Expr:
+    """Return a * b or a / b. `by_one`: one is written as a factor; it stays, as it may have a unit."""
+    if by_one and not a.op == b.op == "num":
+        return make(op, a, b)
+    return mul(a, b) if op == "*" else div(a, b)
+
+
 def power(a: Expr, b: Expr) -> Expr:
     """Return a ** b, simplified."""
     if b is ONE:
@@ -270,7 +277,7 @@ class _Reader:
             op = self.peek()
             self.at += 1
             right = self.unary()
-            left = mul(left, right) if op == "*" else div(left, right)
+            left = _product(op, left, right, ONE in (left, right))
         return left
 
     def unary(self) -> Expr:
@@ -445,7 +452,9 @@ def undelayed(expr: Expr) -> Expr:
 
 
 def _rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
-    simple = {"+": add, "*": mul, "/": div, "**": power}
+    if node.op in ("*", "/"):
+        return _product(node.op, *args, ONE in node.args)
+    simple = {"+": add, "**": power}
     if node.op in simple:
         return simple[node.op](*args)
     return neg(args[0]) if node.op == "neg" else make(node.op, *args, value=node.value)
