@@ -394,6 +394,46 @@ def test_a_diode_is_an_exponential():
     assert abs(law.plant.parameters[own["s1"]].value * term.signals[0].size - 0.046) < 0.002
 
 
+JACKET = """\
+format: thermoctl-plant/1
+title: Iron with a water jacket
+inputs:
+  joule: {unit: W, between_samples: linear}
+  pumped: {unit: L/min, between_samples: linear}
+  inlet: {unit: degC, between_samples: linear, role: temperature}
+  air: {unit: degC, between_samples: linear, role: ambient}
+parameters:
+  C: {value: 3000, unit: J/K, range: [1000, 9000]}
+  G_jacket: {value: 10, unit: W/K, range: [1, 60]}
+  G_air: {value: 1.0, unit: W/K, range: [0.1, 6]}
+nodes:
+  iron: {unit: degC, storage: C, initial: inlet, initial_sigma: 0.5}
+flows:
+  heat: {into: iron, rate: joule, unit: W}
+  jacket: {from: iron, rate: G_jacket * (iron - inlet), unit: W}
+  to_air: {from: iron, rate: G_air * (iron - air), unit: W}
+outputs:
+  T: {value: iron, unit: degC, noise: 0.15}
+"""
+
+
+def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet():
+    """The flow had to have a role, though none says "flow"; differences were tried to the ambient only."""
+    plant, t = loads(JACKET), np.arange(0, 6000, 8.0)
+    cooled = Flow("cooled", ex.parse("3.1 * pumped * (iron - inlet)"), "iron", None)
+    truth = compile_plant(replace(plant, flows={**plant.flows, "cooled": cooled}))
+    drives = {
+        "joule": 600 * (np.sin(t / 400) > 0) + 200,
+        "pumped": 4 + 2 * np.sin(t / 270),
+        "inlet": 18 + 3 * np.sin(t / 900),
+        "air": 23 - 2 * np.sin(t / 1300),
+    }
+    known = case(plant, [truth.measure(Table("run", "", t, drives), 1)], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    best = propose_laws(known, null, limits())[0]
+    assert {s.label for term in best.terms for s in term.signals} == {"pumped", "iron - inlet"}
+
+
 @pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])
 def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     pump = "inputs:\n  spare: {unit: V}\n"

@@ -453,7 +453,7 @@ def undelayed(expr: Expr) -> Expr:
 
 def _rebuild(node: Expr, args: tuple[Expr, ...]) -> Expr:
     if node.op in ("*", "/"):
-        return _product(node.op, *args, ONE in node.args)
+        return _product(node.op, args[0], args[1], ONE in node.args)
     simple = {"+": add, "**": power}
     if node.op in simple:
         return simple[node.op](*args)

@@ -27,6 +27,7 @@ from thermoctl.plant.language import (
     Plant,
     SensorNoise,
 )
+from thermoctl.units import dimension
 
 MAX_ITEMS = 2_000  # inputs, nodes, ... of one file
 SECTIONS = ("inputs", "parameters", "nodes", "flows", "outputs")
@@ -372,7 +373,7 @@ def _least(seconds: Expr, plant: Plant) -> float:
 def _check_use(plant: Plant, items: Items) -> None:
     """Refuse a node that no flow touches, and a parameter or input that no expression reads.
 
-    An input with a role may wait for an effect that reads it."""
+    An input with a role, or a fluid's flow, may wait for an effect that reads it."""
     expressions = [p.expression for p in _places(plant, items)]
     used = set().union(*(ex.names(e) for e in expressions)) | {
         e.value for x in expressions for e in ex.walk(x) if e.op == "first"
@@ -385,5 +386,14 @@ def _check_use(plant: Plant, items: Items) -> None:
         if name not in used:
             raise s.node.error(f"parameter '{name}': nothing uses it; remove it or use it")
     for name, s in items["inputs"].items():
-        if name not in used and plant.inputs[name].role is None:
+        i = plant.inputs[name]
+        if name not in used and i.role is None and not _is_flow(i.unit):
             raise s.node.error(f"input '{name}': nothing reads it; remove it, use it, or give it a role")
+
+
+def _is_flow(unit: str | None) -> bool:
+    """Return whether a unit is of a fluid's flow, for which there is no role."""
+    try:
+        return unit is not None and dimension(unit) in map(dimension, ("m^3/s", "kg/s"))
+    except ValueError:
+        return False

@@ -156,8 +156,7 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     p, out = rig.physics, []
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
     for n in near:
-        if rig.air and n in rig.temperatures:
-            out.append(_between(rig, place, n, rig.air))
+        out += [_between(rig, place, n, i) for i in _beside(rig, n)]
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
     if place.source and p.nodes[place.source].unit == p.nodes[place.target].unit:
         out.append(_between(rig, place, place.source, place.target))
@@ -173,6 +172,15 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
             out.append(_absolute(rig, place, i, p.inputs[i].unit))
     sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
     return [s for s in sized if s is not None]
+
+
+def _beside(rig: Rig, n: str) -> list[str]:
+    """Return the recorded temperatures to which a node gives heat: the ambient, and those of its flows."""
+    if n not in rig.temperatures:
+        return []
+    rates = [ex.names(f.rate) for f in rig.physics.flows.values() if n in (f.source, f.target)]
+    exchanged = {i for read in rates if n in read for i in read & {*rig.heat_inputs}}
+    return sorted({rig.air} | exchanged if rig.air else exchanged, key=lambda i: (i != rig.air, i))
 
 
 def _far(p: Plant, place: Place) -> set[str]:

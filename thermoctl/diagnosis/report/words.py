@@ -156,11 +156,16 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
     if law:
         follows = f"; it follows {listed(law['of'])}" if law["of"] else ""
         return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
-    what = "A small systematic error stays" if _small(rows) else "Something is missing"
     doubted = listed([name(a) for a in result["alternatives"] if a.get("why_not")][:2])
-    if doubted:
-        return f"{what}. What would fit, though nothing else confirms it: {doubted}."
-    return f"{what} that no effect of the catalogue explains."
+    fits = f" What would fit, though nothing else confirms it: {doubted}." if doubted else ""
+    if _small(rows):
+        what = "A small systematic error stays"
+    elif max(result["decision"].get(k, 1.0) for k in ("something", "remains", "flow")) < LIKELY:
+        over = result["decision"]["over_noise"]
+        return f"The errors are {over:.2g} times the noise: something is missing, or sensors are noisier than stated.{fits}"
+    else:
+        what = "Something is missing"
+    return f"{what}.{fits}" if fits else f"{what} that no effect of the catalogue explains."
 
 
 def _families(result: Result) -> list[str]:
