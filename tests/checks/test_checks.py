@@ -331,6 +331,13 @@ def test_a_word_that_the_plant_file_lacks_is_asked_for_once():
     assert "times their noise (in 2 recordings)" in line
 
 
+def test_a_delay_of_an_input_is_checked_as_any_plant():
+    """A finding of actuator_delay writes such a plant, and its own check ended in a traceback."""
+    plant, table = ramps("column: power")
+    delayed = loads(RAMPS.replace("rate: power", "rate: 'delay(power, 2)'"))
+    assert [f.kind for f in checks(delayed, [table])] == [f.kind for f in checks(plant, [table])]
+
+
 @pytest.mark.parametrize("said", ["between_samples: linear", "between_samples: hold"])
 def test_what_the_plant_file_says_of_a_ramp_is_not_doubted(said):
     plant, table = ramps(said)

@@ -35,16 +35,23 @@ def test_an_effect_that_helps_in_one_part_only_is_not_confirmed():
     assert signed_rank(once) < 0.9 < signed_rank(always)
 
 
-def with_errors(energies, reserve=(), misfit=True):
-    """The test, on stated errors (parts, outputs) of each hypothesis instead of refits."""
+def with_errors(energies, reserve=(), misfit=True, recordings=1, shared=True):
+    """The test, on stated errors (parts, outputs) of each hypothesis instead of refits.
+
+    `shared`: are the effects in each recording?"""
     entries = catalogue()
 
     def tried(keys):
-        effects = [SimpleNamespace(key=k, candidate=SimpleNamespace(effect=entries[k[0]])) for k in keys]
+        effects = [
+            SimpleNamespace(key=k, candidate=SimpleNamespace(effect=entries[k[0]], shared=shared))
+            for k in keys
+        ]
         return SimpleNamespace(hypothesis=SimpleNamespace(effects=effects))
 
-    test = Confirm(SimpleNamespace(), {keys: tried(keys) for keys in energies}, reserve, misfit)
-    test._known = {keys: np.log(np.array(e)[:, None]) for keys, e in energies.items()}
+    known = SimpleNamespace(tables=range(recordings))
+    test = Confirm(known, {keys: tried(keys) for keys in energies}, reserve, misfit)
+    logs = {keys: np.log(np.array(e)[:, None]) for keys, e in energies.items()}
+    test._known = {(keys, across): e for keys, e in logs.items() for across in (False, True)}
     return test
 
 
@@ -73,16 +80,21 @@ def test_an_event_beside_a_misfit_is_confirmed_by_another_recording_only():
     """A fan that starts is one course in time; a misfit, too, has some course in time."""
     helps = {NONE: np.full(8, 50.0), frozenset({DRIFT}): np.arange(1.0, 9.0)}
     posterior = Probabilities({frozenset({DRIFT}): 1.0}, {DRIFT: 1.0}, 1.0)
-    kept, after, _ = confirmed(posterior, frozenset({DRIFT}), with_errors(helps), 0.9)
-    assert kept == NONE and after.effects[DRIFT] == 0.5
-    for test in (with_errors(helps, reserve=("run_3",)), with_errors(helps, misfit=False)):
+    for test in (with_errors(helps), with_errors(helps, recordings=2, shared=False)):
+        kept, after, _ = confirmed(posterior, frozenset({DRIFT}), test, 0.9)
+        assert kept == NONE and after.effects[DRIFT] == 0.5
+    for test in (
+        with_errors(helps, reserve=("run_3",)),
+        with_errors(helps, misfit=False),
+        with_errors(helps, recordings=2),
+    ):
         kept, after, _ = confirmed(posterior, frozenset({DRIFT}), test, 0.9)
         assert kept == frozenset({DRIFT}) and after.effects[DRIFT] > 0.99
 
 
 def test_a_hypothesis_that_cannot_be_simulated_is_not_confirmed():
     test = with_errors({NONE: np.full(8, 50.0), ONE: np.full(8, 1.0)})
-    test._known[ONE] = None
+    test._known[ONE, False] = None
     assert test.probability(ONE, A) == 0.0
 
 

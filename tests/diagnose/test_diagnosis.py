@@ -158,6 +158,17 @@ def test_a_reading_that_jumps_in_one_of_two_recordings_is_found_there(tmp_path):
     assert finding["when"][0][0] == pytest.approx(611, abs=10)
 
 
+def test_a_drift_of_two_recordings_is_confirmed_by_each_from_the_other(tmp_path):
+    """Their errors are twice the noise that the plant file states: "nothing else confirms it" was said."""
+    paths = heater(tmp_path, sensor=lambda t, y: y + [0.0, 6e-4] * t[:, None])
+    paths[0].write_text(TWO_BLOCKS.replace("noise: 0.1", "noise: 0.05"))
+    r = diagnosed(paths, tmp_path / "out")
+    (finding,) = r["findings"]
+    assert (finding["effect"], finding["where"]) == ("sensor_drift", "temperature_2")
+    (slope,) = finding["parameters"].values()
+    assert slope["value"] == pytest.approx(6e-4, rel=0.1) and finding["confirmed"] > 0.9
+
+
 def test_heat_from_outside_is_found_with_its_interval(tmp_path):
     r = diagnosed(heater(tmp_path, lambda t, x, a: (0.0, 0.3 * (500 <= t < 900))), tmp_path / "out")
     (finding,) = r["findings"]

@@ -117,7 +117,7 @@ RULES: Mapping[str, Rule] = {
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
     ),
-    "event": Rule("beside a misfit an event needs a recording set aside", {"verdict.confirm._is_event": _no}),
+    "event": Rule("beside a misfit an event needs another recording", {"verdict.confirm._timed": _no}),
     "only noise": Rule(
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
     ),

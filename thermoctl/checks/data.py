@@ -108,7 +108,7 @@ def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarra
 
     Linear interpolation would change the simulated readings. Half the energy of this change, in the noise, is
     the largest possible gain in log likelihood. It has to exceed -log(ALARM)."""
-    moving = {n for n, u in zip(model.inputs, excitation.u.T, strict=True) if np.mean(np.diff(u) != 0) > 0.5}
+    moving = {n for n, u in zip(model.inputs, excitation.u.T, strict=False) if np.mean(np.diff(u) != 0) > 0.5}
     loose = [i for i in driving_inputs(model.plant) if i.name in moving and not i.stated]
     if not loose:
         return []

@@ -44,6 +44,11 @@ class Candidate:
         return self.effect.name, self.place.where
 
     @property
+    def shared(self) -> bool:
+        """Return whether it is the same in every recording."""
+        return not self.begins and not any(p.per_recording for p in self.effect.parameters)
+
+    @property
     def in_plant(self) -> str:
         """Return effect and place as one name, another one where the plant holds such an effect already."""
         label = f"{self.effect.name}_{re.sub(r'[^A-Za-z0-9_]', '_', self.place.where)}"

@@ -39,11 +39,14 @@ def relabels(c: Candidate) -> bool:
 
 
 def _free_member(c: Candidate, side: str) -> bool:
-    """Return whether the displacement contains this side's temperature already, with a free coefficient."""
-    now = ex.undelayed(c.place.symbols["y"])
-    slope = ex.derivative(now, str(c.place.symbols[side].value))
-    parameters = c.rig.plant.parameters
-    return any(n in parameters and parameters[n].range for n in ex.names(slope))
+    """Return whether the displacement contains this side's temperature already, with a free coefficient.
+
+    A coefficient of its distance to another temperature is another physics."""
+    now, plant = ex.undelayed(c.place.symbols["y"]), c.rig.plant
+    side = str(c.place.symbols[side].value)
+    free = (n for n in ex.names(ex.derivative(now, side)) if n in plant.parameters and plant.parameters[n].range)
+    moving = {*plant.nodes, *plant.inputs}
+    return any(ex.names(ex.derivative(now, n)) & moving == {side} for n in free)
 
 
 def simpler(

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.fft import dct
@@ -28,7 +27,7 @@ from thermoctl.diagnosis.data.coordinates import FEWEST
 from thermoctl.diagnosis.evidence.fit import UNIFORM, Fitted, as_refitted
 from thermoctl.diagnosis.evidence.held_out import errors_aside
 from thermoctl.diagnosis.evidence.posterior import Posterior, gaussian
-from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
+from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, Keys
 from thermoctl.diagnosis.verdict.decide import Probabilities
 from thermoctl.plant.fitting.climb import bounded_step
 from thermoctl.plant.simulation.simulate import SimulationError
@@ -37,9 +36,8 @@ from thermoctl.recording.table import Table
 BLOCKS = 8  # parts of each recording
 FLOOR = 0.1  # added to mean squares over the noise: differences between errors far below it are chance
 DRAWS = 3.0  # n independent normal rows have the participation ratio n / 3
-# An event has a course in time, as a misfit has. Parts of one recording cannot tell them apart, only another
-# recording can.
-UNTOLD = 0.5
+UNTOLD = 0.5  # probability of an event beside a misfit that no other recording can tell from it
+ACROSS = 2  # least number of recordings to predict one from the others
 SWEEPS = 2  # solutions; after each, the outputs' weights are computed again
 TINY = 1e-9
 
@@ -119,11 +117,10 @@ class Blocks:
         out[own] = np.clip(step[own] + change, self.low[own] - self.z[own], self.high[own] - self.z[own])
         return out
 
-    @cached_property
-    def predicted(self) -> np.ndarray:
-        """Mean squares over the noise (recordings, BLOCKS, outputs) of each part, fitted to the other parts.
+    def predicted(self, across: bool) -> np.ndarray:
+        """Return the mean squares over the noise (recordings, BLOCKS, outputs) of parts, fitted to others.
 
-        NaN where an output was not measured."""
+        `across`: fitted to the other recordings alone. NaN where an output was not measured."""
         whole, rows = self.sums.sum(axis=(0, 1)), np.maximum(self.count.sum(axis=(0, 1)), 1.0)
         energy = whole[:, -1, -1] / rows
         for _ in range(SWEEPS):
@@ -133,15 +130,17 @@ class Blocks:
         out = np.full(self.count.shape, np.nan)
         for r, b in np.ndindex(*self.count.shape[:2]):
             left = self.sums[r, b]
-            step = self._own(r, self._solved(whole - left, weight), weight)
+            others = whole - (self.sums[r].sum(axis=0) if across else left)
+            step = self._own(r, self._solved(others, weight), weight)
             seen = self.count[r, b] > 0
             out[r, b, seen] = _squares(left, step)[seen] / self.count[r, b, seen]
         return out
 
 
-def _is_event(f: Fitted, key: Key) -> bool:
-    """Return whether an effect depends on the time itself."""
-    return any(e.key == key and e.candidate.effect.timed for e in f.hypothesis.effects)
+def _timed(f: Fitted, key: Key) -> Candidate | None:
+    """Return an effect if it depends on the time itself."""
+    timed = (e.candidate for e in f.hypothesis.effects if e.key == key and e.candidate.effect.timed)
+    return next(timed, None)
 
 
 def _squares(sums: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -171,38 +170,47 @@ class Confirm:
     misfit: bool
 
     def __post_init__(self) -> None:
-        self._known: dict[Keys, np.ndarray | None] = {}
+        self._known: dict[tuple[Keys, bool], np.ndarray | None] = {}
 
     def probability(self, home: Keys, key: Key) -> float:
-        """Return the probability that an effect helps a hypothesis to predict."""
-        if self.misfit and not self.reserve and _is_event(self.tried[home], key):
+        """Return the probability that an effect helps a hypothesis to predict.
+
+        An event has a course in time, as a misfit has. Parts of one recording cannot tell them apart, only
+        another recording can that the event is in, too."""
+        event = None if self.reserve or not self.misfit else _timed(self.tried[home], key)
+        if event and (len(self.case.tables) < ACROSS or not event.shared):
             return UNTOLD
-        mine = self._log_energies(home)
-        parts = [self._log_energies(keys) for keys in self.tried if keys < home and key not in keys]
+        mine = self._log_energies(home, event is not None)
+        parts = [
+            self._log_energies(keys, event is not None)
+            for keys in self.tried
+            if keys < home and key not in keys
+        ]
         others = [part for part in parts if part is not None]
         if mine is None or not others:
             return 0.0 if mine is None else 1.0
         without = min(others, key=lambda part: float(np.nansum(part)))
         return signed_rank(np.nansum(without - mine, axis=1)[np.isfinite(mine).any(axis=1)])
 
-    def _log_energies(self, keys: Keys) -> np.ndarray | None:
+    def _log_energies(self, keys: Keys, across: bool) -> np.ndarray | None:
         """Return ln(E + FLOOR) (parts, outputs); None where a simulation fails."""
-        if keys not in self._known:
+        if (keys, across) not in self._known:
             try:
-                energy = self._aside(keys) if self.reserve else self._left_out(keys)
+                energy = self._aside(keys) if self.reserve else self._left_out(keys, across)
             except (SimulationError, np.linalg.LinAlgError):
                 energy = None
-            self._known[keys] = None if energy is None else np.log(energy + FLOOR)
-        return self._known[keys]
+            self._known[keys, across] = None if energy is None else np.log(energy + FLOOR)
+        return self._known[keys, across]
 
-    def _left_out(self, keys: Keys) -> np.ndarray | None:
-        """Return the mean squares of parts that were left out.
+    def _left_out(self, keys: Keys, across: bool) -> np.ndarray | None:
+        """Return the mean squares of parts that were left out, of one recording after another if `across`.
 
         A hypothesis has two refits (`as_refitted`). The one that fits better is used."""
         f = self.tried[keys]
         both = [Blocks(self.case, f), Blocks(self.case, as_refitted(self.case, f))]
         best = min(both, key=lambda b: float(np.sum(np.log(_fitted(b)))))
-        return best.predicted.reshape(-1, best.predicted.shape[-1])
+        predicted = best.predicted(across)
+        return predicted.reshape(-1, predicted.shape[-1])
 
     def _aside(self, keys: Keys) -> np.ndarray | None:
         """Return the mean squares in the parts of the recordings set aside."""
