@@ -173,3 +173,18 @@ def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
 )
 def test_one_line_says_why_an_effect_is_a_finding_or_none(asked, answer):
     assert why(FOUND, asked).startswith(answer)
+
+
+def test_one_line_says_why_of_a_law_that_is_the_result():
+    law = {"remainder": FOUND["remainder"] | {"law": {"where": "block", "probability": 0.97}}}
+    assert why(FOUND | law, "law") == "law at block: found, probability 0.97"
+
+
+def test_errors_that_may_be_the_sensors_own_are_not_told_as_something_missing():
+    """Noise of 2.3 times the stated one, nothing else: "something is missing that no effect explains"."""
+    numbers = {"row": "nothing is supported for sure and a remainder stays", "over_noise": 2.29}
+    numbers |= {"something": 0.0, "known": 0.0, "remains": 0.0, "flow": 0.01}
+    plain = FOUND | {"verdict": "unexplained", "findings": [], "decision": numbers}
+    assert "2.3 times the noise" in words(plain) and "noisier than stated" in words(plain)
+    assert "Something is missing" not in words(plain)
+    assert "Something is missing" in words(plain | {"decision": numbers | {"remains": 0.99}})

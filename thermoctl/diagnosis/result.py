@@ -342,15 +342,15 @@ def _mismatch(d: Diagnosis) -> list[dict[str, Any]]:
             "node": node,
             "missing_flow_rms": d.missing_flow,
             "missing_flow_unit": flow_unit(d.case.plant, node) if node else None,
-            "when": _when(d, o),
+            **_when(d, o),
             "follows": d.before.follows,
         }
         for o in sorted(wrong, key=lambda o: -rms[o] / max(noise[o], 1e-300))
     ]
 
 
-def _when(d: Diagnosis, output: str) -> list[list[float]]:
-    """Return the intervals, s, in which an output's error is large, in the recording where it is largest."""
+def _when(d: Diagnosis, output: str) -> dict[str, Any]:
+    """Return the recording where an output's error is largest, and the intervals, s, in which it is large."""
     j = d.null.fit.model.outputs.index(output)
     errors = [e[:, j] for e in d.null.fit.residuals]
     sizes = [float(np.nanmean(e**2)) if np.isfinite(e).any() else 0.0 for e in errors]
@@ -367,7 +367,7 @@ def _when(d: Diagnosis, output: str) -> list[list[float]]:
                 out[-1][1] = end
             else:
                 out.append([start, end])
-    return out
+    return {"recording": d.case.tables[r].name, "when": out}
 
 
 def _hypotheses(d: Diagnosis) -> list[dict[str, Any]]:
@@ -407,6 +407,8 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
     """Return the fitted effects that are not findings, each in its best hypothesis, with the reason."""
     out: dict[Key, dict[str, Any]] = {}
     shown = {e.key for e in d.shown} - d.of_family.keys()
+    if d.law is not None:
+        shown |= {d.law.placed.key}
     for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
         for key in sorted(keys - shown - out.keys()):

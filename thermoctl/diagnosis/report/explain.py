@@ -47,6 +47,9 @@ def why(result: Mapping[str, Any], asked: str) -> str:
         if is_asked(name := f"{f['effect']} at {f['where']}"):
             sure, confirmed = (figures.chance(f[k]) for k in ("probability", "confirmed"))
             return f"{name}: a finding, probability {sure}; that other data confirm it {confirmed}"
+    law = (result["remainder"] or {}).get("law")
+    if law and is_asked(name := f"law at {law['where']}"):
+        return f"{name}: found, probability {figures.chance(law['probability'])}"
     for e in result["lost"]:
         if is_asked(name := f"{e['effect']} at {e['where']}"):
             beside = f" beside {' and '.join(e['beside'])}" if e["beside"] else ""

@@ -164,7 +164,7 @@ def _remains(drawn: Sequence[Curve], result: Mapping[str, Any]) -> str:
             facts.append(f"A flow of {size} (rms) into {m['node']} would bring the plant to the recordings.")
         if m["when"]:
             spans = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m["when"][:6])
-            facts.append(f"The error of {m['channel']} is largest at {spans}.")
+            facts.append(f"The error of {m['channel']} is largest at {spans} of {m['recording']}.")
     return body + _table(figures.remainder_rows(result)) + _items(facts)
 
 

@@ -44,7 +44,9 @@ def _free_member(c: Candidate, side: str) -> bool:
     A coefficient of its distance to another temperature is another physics."""
     now, plant = ex.undelayed(c.place.symbols["y"]), c.rig.plant
     side = str(c.place.symbols[side].value)
-    free = (n for n in ex.names(ex.derivative(now, side)) if n in plant.parameters and plant.parameters[n].range)
+    free = (
+        n for n in ex.names(ex.derivative(now, side)) if n in plant.parameters and plant.parameters[n].range
+    )
     moving = {*plant.nodes, *plant.inputs}
     return any(ex.names(ex.derivative(now, n)) & moving == {side} for n in free)
 
