@@ -86,6 +86,8 @@ class Column:
 
     def changes(self, trajectory: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return its forces by state and its changes of outputs along a trajectory, all numbers finite."""
+        if self.candidate.begins.get(trajectory.drive.name, 0.0) < 0:
+            return {}, {}  # an event that comes later
         try:
             parts = self.overlay().changes(self.values, trajectory)
         except (KeyError, ex.ExpressionError):

@@ -28,7 +28,7 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, score
 from thermoctl.diagnosis.search.metric import Metric, Pushed
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
-from thermoctl.diagnosis.search.shapes import shape_grid
+from thermoctl.diagnosis.search.shapes import COARSER, shape_grid
 from thermoctl.plant.fitting.cores import ABREAST, each
 
 EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
@@ -125,7 +125,7 @@ def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
     kinds = direction.candidate.effect.shapes.values()
     if "onsets" not in kinds and "windows" not in kinds:
         return direction
-    step = rig.duration / ONSETS
+    step = rig.duration / ONSETS * (COARSER if direction.candidate.begins else 1)
     while step > 0.5 * rig.sample:
         near = np.concatenate(
             [
@@ -180,10 +180,10 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
     }
     windowed = "windows" in effect.shapes.values()
     if windowed:
-        duration = c.rig.duration
+        duration, count = c.rig.duration, ONSETS // (COARSER if c.begins else 1)
         grids["window"] = [
             {"start": float(v), "end": 10 * duration}
-            for v in (np.linspace(0, duration, ONSETS + 1)[:-1] if edges is None else edges)
+            for v in (np.linspace(0, duration, count + 1)[:-1] if edges is None else edges)
         ]
     phases = [{"phase": 0.0}, {"phase": float(np.pi / 2)}] if "phases" in effect.shapes.values() else [{}]
     shapes = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,6 @@ from thermoctl.diagnosis.search.sketch import likeliest
 LOUD = 2.0  # residual's rms over the noise, from which energy is the better guide
 PROMISED = 30  # number of directions whose gain in log likelihood is predicted
 ROOM = 2  # largest number of places of one effect among them, over PLACES_EACH
-CLOCKS = 2  # largest number of choices of the recordings in which an event happens, at one place
 
 
 @dataclass(frozen=True)
@@ -112,11 +110,13 @@ def places(case: Case) -> dict[str, set[str]]:
 
 def _foremost(metric: Metric, rig: Rig, found: list[Direction]) -> list[Direction]:
     """Return the directions whose gain is predicted, events at their best times: the grid's are too rough."""
-    first, clocks = list[Direction](), Counter[Key]()
+    first, clocks = list[Direction](), set[Key]()
     for d in foremost(found, ROOM * PLACES_EACH):
-        clocks[d.candidate.key] += bool(d.candidate.begins)
-        if not d.candidate.begins or clocks[d.candidate.key] <= CLOCKS:
-            first.append(d)
+        if d.candidate.begins:  # only the best one at each place
+            if d.candidate.key in clocks:
+                continue
+            clocks.add(d.candidate.key)
+        first.append(d)
     return [sharpened(metric, rig, d) for d in first[:PROMISED]]
 
 

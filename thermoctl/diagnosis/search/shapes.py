@@ -19,6 +19,7 @@ ROUNDED = 1e-9  # gap between readings that only the arithmetic makes, over thei
 WHOLE = 0.01  # largest distance of a rounded reading from a multiple of its step, in steps
 # Periods over the span of the signal: up to the first number all are tried, up to the second the strongest.
 SLOW_TURNS, FINE_TURNS = 60.0, 4000
+COARSER = 3  # ratio of the steps of onset times, where the recording of an event is tried, too
 STRONGEST = 16  # number of the strongest periods that are tried
 
 
@@ -59,8 +60,8 @@ def shape_grid(kind: str, candidate: Candidate, runs: Sequence[Simulation]) -> G
     holds `longest`, the longest period that repeats in the recordings. A level holds `least` and `most`, the
     ends of its prior."""
     if kind in ("onsets", "times", "lags", "delays"):
-        between = [{"onset": 0.0}] if kind == "onsets" and candidate.begins else []
-        return between + _times(kind, candidate.rig.duration, candidate.rig.sample)
+        grid = _times(kind, candidate.rig.duration, candidate.rig.sample)
+        return [{"onset": 0.0}, *grid[1::COARSER]] if kind == "onsets" and candidate.begins else grid
     if kind in ("periods", "distances"):
         return _positions(kind, candidate, runs)
     if kind in ("speeds", "creep_speeds"):

@@ -30,7 +30,7 @@ from thermoctl.diagnosis.search.screen import Group
 from thermoctl.plant import expression as ex
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
-EXACT = 4_000  # up to so many columns all are simulated
+EXACT = 6_000  # up to so many columns all are simulated
 SKETCHES = 32  # number of sketches: a gain is known within 25 %
 KEPT = 1_500  # number of columns that are simulated, for each metric
 SAMPLES = 4_000  # largest number of samples of an adjoint run; forces are summed between samples
