@@ -114,3 +114,24 @@ def test_a_damaged_result_is_refused_before_the_work(rig, out, tmp_path, text):
     (tmp_path / "diagnosis.json").write_bytes(text)
     with pytest.raises(InputError, match=r"diagnosis\.json: damaged .* was expected; diagnose all"):
         diagnose(plant, tables[1:2], tmp_path / "1", earlier=tmp_path, progress=pytest.fail)
+
+
+def test_an_event_of_an_earlier_recording_lasts_in_a_new_one(tmp_path):
+    """Its clock names a recording that is not here: the hypothesis would be lost with its evidence."""
+    path = tmp_path / "plant.yaml"
+    path.write_text(ONE_BLOCK)
+    plant, t = load(path), np.arange(400.0)
+    path.write_text(
+        ONE_BLOCK.replace("flows:\n", "flows:\n  opened: {from: block, rate: 0.05 * (block - air)}\n")
+    )
+    rng, tables = np.random.default_rng(4), []
+    for day, true in enumerate((plant, load(path), load(path))):
+        heat = 4.0 * rng.integers(0, 2, 8)[(t // 50).astype(int)]
+        table = Table(f"day_{day}", f"day_{day}", t, {"heat": heat, "air": 20 + 0 * t})
+        tables.append(compile_plant(true).measure(table, seed=day))
+    first = diagnose(plant, tables[:2], tmp_path / "0")
+    then = diagnose(plant, tables[2:], tmp_path / "1", earlier=tmp_path / "0")
+    (event,) = first["findings"]
+    assert event["effect"] == "conductance_step" and event["recording"] == "day_1" and event["lasts"]
+    name = "conductance_step at loss"
+    assert gains(then)[name] > gains(first)[name] + 3

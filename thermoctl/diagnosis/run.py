@@ -88,7 +88,7 @@ def diagnose(
     proposed = None if stopped() else propose(diagnosis, drivable, limits, progress)
     result = contract(diagnosis)
     result["next_experiment"] = proposed[0] if proposed else None
-    result["trends"] = trends(diagnosis.case, diagnosis.best, diagnosis.shown, sizes)
+    result["trends"] = trends(diagnosis, sizes)
     result["notes"] += trend_notes(result["trends"])
     if before.recordings:
         result["notes"].insert(0, f"goes on from {len(before.recordings)} earlier recordings ({earlier})")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from thermoctl.diagnosis.hypothesis.builder import Candidate as Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
@@ -78,3 +79,16 @@ def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
     for own in names[:-1]:
         clocks[f" in {own}"] = dict.fromkeys([*names, ""], before) | {own: 0.0}
     return clocks
+
+
+def found_again(found: Sequence[Candidate], key: Key, label: str) -> Candidate:
+    """Return a candidate by its effect, place and label. Raises StopIteration.
+
+    An event that began in an earlier recording is past in all of these, or lasts in all."""
+    choice, _, clock = label.partition(" ")
+    same = [c for c in found if (c.key, c.label) == (key, label)]
+    if same or not clock:
+        return next(iter(same))
+    c = next(c for c in found if (c.key, c.label) == (key, choice))
+    far = FAR * c.rig.duration * (1 if clock.startswith("from ") else -1)
+    return replace(c, label=label, begins=dict.fromkeys([*(d.name for d in c.rig.drives), ""], far))

@@ -18,19 +18,22 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
-from thermoctl.diagnosis.evidence.posterior import Placed, Posterior
+from thermoctl.diagnosis.evidence.posterior import Posterior
+from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.dates import begun, line
 
 
-def trends(
-    case: Case, f: Fitted, shown: Sequence[Placed], before: Sequence[Mapping[str, Any]] = ()
-) -> list[dict[str, Any]]:
+def trends(d: Diagnosis, before: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
     """Return `trends` of the result: each effect's size by recording, and its change a month.
 
-    `before`: the trends of an earlier diagnosis, whose recordings come first."""
+    An event that begins with a recording and is no finding would hide a trend: without it, if that was
+    refitted. `before`: the trends of an earlier diagnosis, whose recordings come first."""
+    named = {e.key for e in d.shown}
+    lasting = {e.key for e in d.best.hypothesis.effects if e.key in named or not e.candidate.begins}
+    f = next((w.fitted for w in d.searched.tried if w.fitted.hypothesis.keys == lasting), d.best)
+    case, shown = d.case, [e for e in f.hypothesis.effects if e.key in named]
     posterior = Posterior(case, f.plant, f.hypothesis.effects)
     dates = [begun(t) for t in case.tables]
     old = {(e["effect"], e["where"], e["parameter"]): e["recordings"] for e in before}

@@ -13,7 +13,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
 from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
-from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, found_again
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
@@ -306,8 +306,7 @@ def remade(
     drives = case.drives(case.null.model)
     try:
         for e in effects:
-            found = candidates(case.rig(plant, drives), entries)
-            c = next(c for c in found if (c.key, c.label) == (e.key, e.label))
+            c = found_again(candidates(case.rig(plant, drives), entries), e.key, e.label)
             inputs = plant.inputs.keys()
             plant = c.extend(e.values, e.ranges)
             if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
