@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import thermoctl
-from thermoctl.control import faults, recorded_faults, typed
+from tests import typed
+from thermoctl.control import faults, recorded_faults
 from thermoctl.control.model import CompensatorModel, zero_model
 from thermoctl.daemon.keep import _fingerprint
 from thermoctl.rig.channels import AT, COIL, DEFAULT, FIXED, GROUPS, MAX_POINTS, Point, of_points
@@ -75,7 +76,7 @@ def test_the_faults_of_old_recordings_keep_their_bits():
 
 
 def test_types_of_the_law_are_up_to_date(capsys):
-    """`python -m thermoctl.control.typed --check`: law.pxd agrees with law.py and Parameters."""
+    """`python -m tests.typed --check`: law.pxd agrees with law.py and Parameters."""
     assert typed.main(["--check"]) == 0, capsys.readouterr().out
 
 
@@ -137,11 +138,12 @@ def test_a_limit_is_added_in_one_row(tmp_path):
         f"""
 from tests import reference
 from thermoctl.configuration import settings
-from thermoctl.control import law, model, typed
+from tests import typed
+from thermoctl.control import law, model
 from thermoctl.daemon.tick.assemble import law_parameters
 p = law_parameters(settings.load_settings({str(config)!r}))
 tick = law.Law(model.zero_model(), model.Parameters.unpack(p.pack()), 0.001)
-text = (typed.HERE / "law.pxd").read_text()
+text = (typed.CONTROL / "law.pxd").read_text()
 print(json.dumps({{
     "law": tick.p.voltage_limit_v, "page": "largest mean coil voltage" in reference.configuration(),
     "declared": "voltage_limit_v" in typed.declarations(text, law), "stale": "voltage_limit_v" not in text,
