@@ -37,7 +37,9 @@ def console_log(event: str, **fields: Any) -> None:
     if _to_journal():
         _stderr.write(json.dumps({"time": stamp, "event": event, **given}, default=str))
     else:
-        _stderr.write(" ".join([f"{stamp} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in given.items())]))
+        _stderr.write(
+            " ".join([f"{stamp} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in given.items())])
+        )
 
 
 def failed(what: str, error: BaseException) -> None:
