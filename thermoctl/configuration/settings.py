@@ -246,9 +246,9 @@ class HalSettings:
     """The hardware, or its simulation."""
 
     backend: str = option(
-        "where readings come from: a simulated plant, devices, or a recording that is played back",
+        "where readings come from: a simulated plant, or devices",
         restart=True,
-        choices=("simulated", "devices", "replay"),
+        choices=("simulated", "devices"),
     )
     plant: str = option(
         "plant file of back end `simulated`, relative to this file; the compensator's model assumes this plant",
@@ -274,7 +274,6 @@ class HalSettings:
     sensor_period_s: float = option(
         "sampling period of the simulated temperature sensors", 0.1, "s", 1e-3, 60.0, restart=True
     )
-    recording: str = option("recording that back end `replay` plays, relative to this file", "", restart=True)
     run_dir: str = option(
         "folder of the virtual rig's control socket and reference recording, relative to this file",
         "../run/wire",
@@ -749,7 +748,7 @@ def _check_together(settings: Settings, root: Node) -> None:
         raise place("protection", "required").error(
             "control.mode: position needs position_um in protection.required: the first target is the measured position"
         )
-    needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
+    needed = {"simulated": "plant", "devices": "devices"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: back end '{hal.backend}' needs it")
     backend = {"device": "devices", "tick": "simulated"}.get(settings.loop.pace, hal.backend)

@@ -24,7 +24,7 @@ class Simulation:
 
     `row` is the newest record row (`settings.row` has its signals), `law` the control law,
     `backend` the open back end.
-    The setting hal.backend must be simulated or replay. `model`, `parameters` and
+    The setting hal.backend must be simulated. `model`, `parameters` and
     `backend`: those of the settings if None.
     """
 
