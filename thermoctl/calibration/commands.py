@@ -129,7 +129,7 @@ def model(action: str, models: str | None, name: str | None) -> int:
     return 0
 
 
-def tune(config: str, method: str, write: bool, yes: bool) -> int:
+def tune(config: str, write: bool, yes: bool) -> int:
     """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
 
     On request the proposal is proven on the rig, step by step, and written. Returns 1 when the user answered
@@ -140,7 +140,7 @@ def tune(config: str, method: str, write: bool, yes: bool) -> int:
     one = schedules.triangles(settings, rig.now()["compensated_um"])
     if not drive.agreed(rig, [one] * (TESTS if write else 1), yes):
         return 1
-    tuned = tune_loop(rig, method, write, Keyboard(False), lambda line: print(line, flush=True))
+    tuned = tune_loop(rig, write, Keyboard(False), lambda line: print(line, flush=True))
     if write and tuned.proposed != tuned.present:
         tuning.write(Path(settings.path), tuned.proposed, settings.axis)
         print(f"written to {settings.path}; 'thermoctl reload' applies it")

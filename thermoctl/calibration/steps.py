@@ -165,7 +165,7 @@ def pid(rig: drive.DrivenRig) -> Pid:
     before = after = NOTHING
     said: list[str] = []
     try:
-        tuned = tune(rig, "imc", True, Keyboard(False), said.append)
+        tuned = tune(rig, True, Keyboard(False), said.append)
         proposed, before, after = tuned.proposed, tuned.before, tuned.after or NOTHING
         summary = f"present: {before}; " + (
             "nothing to change" if proposed == tuned.present else f"proposed, each step measured: {after}"
