@@ -654,7 +654,8 @@ def _value(section: _Options, key: str, kind: Any, row: Option) -> Any:
         return _number(node, label, row, whole=kind is int)
     if origin is dict:
         mapping = _Options(node, label, section.channels)
-        return _texts(mapping) if inner[1] is str else _limits(mapping, row)
+        is_text = inner[1] is str
+        return {n: mapping.text(n) for n in mapping.node.value} if is_text else _limits(mapping, row)
     if origin is tuple and inner[0] is Node:
         return tuple(section.list(key))
     if origin is tuple:
@@ -694,10 +695,6 @@ def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
         raise node.error(
             f"{label}: '{text}': the unit does not fit ({e}); expected {unit or 'no unit'}"
         ) from None
-
-
-def _texts(mapping: Section) -> dict[str, str]:
-    return {name: mapping.text(name) for name in mapping.node.value}
 
 
 def _limits(mapping: _Options, row: Option) -> dict[str, float]:

@@ -143,7 +143,8 @@ def _described(
     row = faults.BY_NAME[fault.name]
     hit = _hit(fault, found, begin_s, channels)
     loss, reading = _loss(fault, hit, found, now_s)
-    is_stated = loss is not None and (loss.is_certain or (loss is not losses.SLOW and _is_old(reading)))
+    is_old = (reading.get("age_s") or 0.0) > losses.LATE_WINDOW_S
+    is_stated = loss is not None and (loss.is_certain or (loss is not losses.SLOW and is_old))
     late_s = fault.late_s if fault.may_be_late and not cause else 0.0
     return {
         "name": fault.name,
@@ -191,10 +192,6 @@ def _loss(
         if loss is not None:
             return loss, found[role]
     return None, {}
-
-
-def _is_old(reading: Mapping[str, Any]) -> bool:
-    return (reading["age_s"] or 0.0) > losses.LATE_WINDOW_S
 
 
 def _remedy(loss: losses.Loss, reading: Mapping[str, Any], now_wall_s: float) -> str:

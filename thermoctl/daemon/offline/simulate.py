@@ -85,7 +85,7 @@ class Simulation:
                 law.step(period_s, rig.command, rig.value, rig.external)
                 rig.actuate()
             else:
-                rig.tick(now_s, period_s, 0.0, _no_clock)
+                rig.tick(now_s, period_s, 0.0, lambda: 0)
         return self.row
 
     def until(self, condition: Any, limit_s: float) -> bool:
@@ -107,10 +107,6 @@ class Simulation:
         """Disable the amplifier and close the back end."""
         self.backend.write(0.0, False)
         self.backend.close()
-
-
-def _no_clock() -> int:
-    return 0
 
 
 SETTLE_S = 0.5  # settling time at the setpoint before the deviation counts

@@ -63,7 +63,8 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
         except KeyboardInterrupt:
             return 0
         finally:
-            _ignore_signals()
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
             show.close()
 
 
@@ -114,11 +115,6 @@ def _stopped_by_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _ignore_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
 
 
 class _Demo:
