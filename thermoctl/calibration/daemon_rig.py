@@ -167,9 +167,8 @@ class DaemonRig:
         with contextlib.suppress(InputError):
             daemon.ask({"command": "disarm"})
             return
-        until = (
-            time.monotonic() + RESTART_S
-        )  # the command process alone may have ended; the supervisor starts it again
+        # The command process alone may have ended; the supervisor starts it again.
+        until = time.monotonic() + RESTART_S
         while time.monotonic() < until:
             with contextlib.suppress(InputError):
                 ask(self.settings.socket.path, {"command": "disarm"})

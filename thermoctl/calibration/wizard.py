@@ -83,10 +83,8 @@ class Wizard:
         self.fingerprint = self._fingerprint()
         self.done: dict[str, steps.Result] = {}
         self.at_s: dict[str, float] = {}  # time reached by an interrupted test
-        self._used_s, self._tested_s = (
-            0.0,
-            0.0,
-        )  # wall and rig seconds of tests in this run, for the time left
+        # Wall and rig seconds of tests in this run, for the time left.
+        self._used_s, self._tested_s = (0.0, 0.0)
         for name in TESTS:
             if name not in tests:
                 raise InputError(f"{self.experiments}: no experiment '{name}'; a calibration needs it")

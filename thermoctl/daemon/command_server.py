@@ -65,9 +65,8 @@ class Commands:
         self.reload_settings, self.log = reload_settings, log
         self.expected_hz = arrival.expected_hz(settings)
         self.can_drive = can_drive(settings)
-        if shared.counters[
-            TRIAL
-        ]:  # gains of a command process that was killed; the file still has the gains before it
+        # Gains of a command process that was killed; the file still has the gains before it.
+        if shared.counters[TRIAL]:
             with contextlib.suppress(InputError):
                 self.settings = reload_settings(settings, settings)[0]
             with contextlib.suppress(InputError):  # the loop is not there: the next arming tries again

@@ -75,9 +75,8 @@ class Misfit:
         alarm = None
         if not rows.shape[1]:
             return alarm
-        changed = (
-            np.diff(rows[1], prepend=self._last_c) != 0.0
-        )  # the signal holds between samples of the sensor
+        # The signal holds between samples of the sensor.
+        changed = np.diff(rows[1], prepend=self._last_c) != 0.0
         self._last_t, self._last_c = rows[0, -1], rows[1, -1]
         if not changed.any():
             return alarm

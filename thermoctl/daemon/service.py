@@ -133,9 +133,8 @@ def stop(settings: Settings) -> int:
         print("not running")
         return 0
     for part in settings.parts:
-        with contextlib.suppress(
-            InputError
-        ):  # a process that does not answer is ended, too; the amplifier is disabled when it ends
+        # A process that does not answer is ended, too; the amplifier is disabled when it ends.
+        with contextlib.suppress(InputError):
             ask(part.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:

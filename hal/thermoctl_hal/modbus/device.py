@@ -194,9 +194,8 @@ class ModbusDevice(Device):
                 ):
                     # The device may not answer if a block has gaps.
                     again = plan_blocks(block.members, 0, self._spec.max_block)
-                self._blocks = (
-                    self._blocks[at + 1 :] + self._blocks[:at] + again
-                )  # the next poll starts after it
+                # The next poll starts after it.
+                self._blocks = self._blocks[at + 1 :] + self._blocks[:at] + again
                 return
 
     def silence(self) -> str:

@@ -281,9 +281,8 @@ def _interrupts(base: Path, cpu: int) -> Check:
     mine = []
     for irq in sorted((base / "proc/irq").glob("[0-9]*"), key=lambda p: int(p.name)):
         allowed = _text(irq / "effective_affinity_list") or _text(irq / "smp_affinity_list")
-        if cpu in cpu_list(allowed) and any(
-            p.is_dir() for p in irq.iterdir()
-        ):  # a directory names its handler
+        # A directory names its handler.
+        if cpu in cpu_list(allowed) and any(p.is_dir() for p in irq.iterdir()):
             mine.append(irq.name)
     shown = ", ".join(mine[:8]) + (", .." if len(mine) > 8 else "")
     return Check(

@@ -112,9 +112,8 @@ class Bridge:
     def close(self) -> None:
         """Publish `offline` and disconnect."""
         if self.connected.is_set():
-            with contextlib.suppress(
-                RuntimeError, ValueError
-            ):  # the connection was just lost: the last will publishes it
+            # The connection was just lost: the last will publishes it.
+            with contextlib.suppress(RuntimeError, ValueError):
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)

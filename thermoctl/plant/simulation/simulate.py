@@ -580,9 +580,8 @@ class Stepper:
         self._want = np.zeros(1)
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
         self._atol = self.rtol * (np.abs(self.x) * 1e-2 + 1e-3)
-        self._memory = np.zeros(
-            self._library.memory_size()
-        )  # the matrix of the exponential method, see integrator.h
+        # The matrix of the exponential method, see integrator.h.
+        self._memory = np.zeros(self._library.memory_size())
         tail = (self._atol, self.x, self._y, self._want, self._memory)
         self._pointers = tuple(
             [a.ctypes.data for a in part] for part in ((self._u, self._p, self._width), tail)
