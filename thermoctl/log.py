@@ -23,8 +23,7 @@ _LAST = ("rig", "axis", "run")  # fields at a line's end
 def bind(**fields: Any) -> None:
     """Add fields to all further events of this process and of those that it forks.
 
-    Empty ones are left out.
-    """
+    Empty ones are left out."""
     _bound.update({name: value for name, value in fields.items() if value})
 
 

@@ -73,8 +73,7 @@ def calibrate_refined(
     """Calibrate with and without refining the thermal model by its prediction errors.
 
     The model is refined on all tests but the last. Return the one that predicts the thermometers of the last
-    test better, and a sentence that compares both.
-    """
+    test better, and a sentence that compares both."""
     plain = calibrate(tests, order)
     refined_model = refine_model(plain[0], tests[:-1])
     if refined_model is plain[0]:
@@ -117,8 +116,7 @@ def identify(tests: list[Recorded], order: int | None) -> StateSpace:
     """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
     A change of the air shifts every rise by C b_air. This effect is simulated with the model of the previous
-    round and subtracted. `order` None: selected by BIC in the last round.
-    """
+    round and subtracted. `order` None: selected by BIC in the last round."""
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(
@@ -162,8 +160,7 @@ def compensator(
 
     Sensor readings come every SENSOR_S. Process noise is per second, so it scales with the period. A
     quantised reading ten times a second brings no more information than one a second, so its variance grows
-    in proportion.
-    """
+    in proportion."""
     model = kalman.model
     scale = SENSOR_S / model.period_s
     at_sensor = _at_period(model, SENSOR_S)
@@ -196,7 +193,6 @@ def compensator(
 def _at_period(model: StateSpace, period_s: float) -> StateSpace:
     """Resample the model; keep the air's effect (K per K/s over one period) exact.
 
-    The air's change is a shift of all rises, not a rate that is held into the network.
-    """
+    The air's change is a shift of all rises, not a rate that is held into the network."""
     fast = model.resample(period_s)
     return replace(fast, b=np.column_stack([fast.b[:, 0], model.b[:, 1] * period_s / model.period_s]))

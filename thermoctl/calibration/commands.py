@@ -39,8 +39,7 @@ def run_experiment(
 
     With a running daemon it runs in real time under the daemon's protections. Without one it runs on the
     simulated back end, faster than real time. An experiment of inputs can also run on a plant file. Returns 1
-    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there.
-    """
+    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there."""
     if experiment.lists_inputs(name):
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
@@ -133,8 +132,7 @@ def tune(config: str, write: bool, yes: bool) -> int:
     """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
 
     On request the proposal is proven on the rig, step by step, and written. Returns 1 when the user answered
-    no.
-    """
+    no."""
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     one = schedules.triangles(settings, rig.now()["compensated_um"])
@@ -169,8 +167,7 @@ def calibrate(
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
     Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
-    calibrated, HardwareError for one that refuses.
-    """
+    calibrated, HardwareError for one that refuses."""
     load("matplotlib", "calibrate")  # the report needs it: if it is missing, end before any test
     settings = load_settings(config)
     rig = drive.rig_of(settings)

@@ -52,8 +52,7 @@ def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     """Report which rig will move, how far, how long, and the coil's predicted temperature.
 
     Ask before a daemon's rig moves, unless `yes`. Raises InputError for setpoints outside the configuration's
-    limits, for a coil that would become too hot, and when nobody can be asked.
-    """
+    limits, for a coil that would become too hot, and when nobody can be asked."""
     settings = rig.settings
     p = settings.protection
     low, high = within_limits(settings, schedules)

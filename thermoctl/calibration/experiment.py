@@ -67,8 +67,7 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    Returns 1 when the user answered no, ENDED when it ended early.
-    """
+    Returns 1 when the user answered no, ENDED when it ended early."""
     schedules.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "

@@ -71,8 +71,7 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
     """Refuse an experiment whose predicted readings exceed the limits of `protection`.
 
-    Raises InputError that names the reading.
-    """
+    Raises InputError that names the reading."""
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column

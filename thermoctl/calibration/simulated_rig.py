@@ -103,8 +103,7 @@ class SimulatedRig:
 
         `gains` are applied after arming, without a jump. `earlier`, `at_s` and `rest` are not used: the rows
         are reproducible, and the rig starts at rest.
-        Raises Aborted when the law leaves ARMED or the user ends it.
-        """
+        Raises Aborted when the law leaves ARMED or the user ends it."""
         settings = with_model(self.settings, model)
         simulation = self.simulation(settings, model)
 
@@ -137,8 +136,7 @@ def play(
     """Run a schedule on a rig, which is armed first; yield blocks of record rows, every `every`-th tick.
 
     Each block is given out before the next is computed, so an abort loses nothing. Raises Aborted when the
-    law leaves ARMED (the fault bits are named) or `stop()` turns true.
-    """
+    law leaves ARMED (the fault bits are named) or `stop()` turns true."""
     period, waiting = simulation.period_s, schedule.commands()
     ticks = round(schedule.duration_s / period)
     block, began, k = [], time.monotonic(), 0

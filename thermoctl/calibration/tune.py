@@ -49,8 +49,7 @@ def tune(rig: drive.DrivenRig, verify: bool, keyboard: Keyboard, say: Callable[[
 
     With `verify` the result's gains are proven, or the present ones. Raises InputError where the test gives
     no gains. Raises Disagrees where a step's loop is not as predicted, and HardwareError where the rig ended
-    a test. Then the present gains are in force.
-    """
+    a test. Then the present gains are in force."""
     settings = rig.settings
     period_s, average = settings.loop.period_s, int(settings.control.moving_average)
     present = _present(rig)

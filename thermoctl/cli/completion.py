@@ -20,8 +20,7 @@ REMEDY = "run it as root, or give --root"
 def install(parser: argparse.ArgumentParser, root: str | Path = "/") -> list[Path]:
     """Write the completions of bash and zsh below `root`; return their paths.
 
-    Raises InputError when one cannot be written.
-    """
+    Raises InputError when one cannot be written."""
     written = []
     for shell, place in PLACES.items():
         path = Path(root, place)

@@ -310,8 +310,7 @@ class Settings:
     A rig file with `axes` gives two kinds of settings. The settings of one axis have the same fields as
     those of a rig without axes; `axis` is its name, `rig_socket` the rig's socket. The settings of the whole
     rig have `axes` and the channels of all axes. Their sections `control`, `compensation` and `protection`
-    are those of the first axis.
-    """
+    are those of the first axis."""
 
     path: str
     rig: RigSettings
@@ -419,8 +418,7 @@ def _plain(value: Any) -> Any:
 def load_settings(path: str | Path, axis: str = "") -> Settings:
     """Read and check a configuration, of one axis where the rig has several: `axis`, or PATH#AXIS.
 
-    Raises InputError with file:line:column for the first error, or where an axis must be chosen.
-    """
+    Raises InputError with file:line:column for the first error, or where an axis must be chosen."""
     file, _, named = str(path).rpartition("#") if not Path(path).exists() else (str(path), "", "")
     rig = load_rig(file or path)
     if axis := axis or (named if file else ""):

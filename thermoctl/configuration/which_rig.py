@@ -29,8 +29,7 @@ def find_config(given: str | None) -> tuple[str, str]:
     """Return (the configuration's path, how it was found). Raises InputError when there is none.
 
     A file that is named but missing is returned: reading it gives the error. Another rig never takes its
-    place.
-    """
+    place."""
     if given:
         return given, "--config"
     if named := os.environ.get("THERMOCTL_CONFIG"):

@@ -12,8 +12,7 @@ def table(meta: Mapping[str, str]) -> dict[int, str]:
     """Return bit -> name for a recording with this metadata.
 
     A recording of another program (a CSV file) has no metadata: the present table applies. Raises ValueError
-    when the metadata is damaged.
-    """
+    when the metadata is damaged."""
     if "faults" not in meta:
         return faults.NAMES
     stored = json.loads(meta["faults"])

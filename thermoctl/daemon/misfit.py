@@ -38,8 +38,7 @@ class Misfit:
 
     Pass rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. The
     division into calls has no influence. A model without a coil temperature has no innovations and never
-    raises an alarm.
-    """
+    raises an alarm."""
 
     def __init__(self, model: CompensatorModel):
         self._gain, self._noise = float(model.C[0] @ model.gain[:, 0]), math.sqrt(model.R_v)
@@ -58,8 +57,7 @@ class Misfit:
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
         """Add rows (n,) of each signal; return the newest alarm that they raise.
 
-        NaN innovations (no sample yet) are left out.
-        """
+        NaN innovations (no sample yet) are left out."""
         rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
         alarm = None
         if not self._watches or not rows.shape[1]:

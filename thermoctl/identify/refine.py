@@ -44,8 +44,7 @@ def by_prediction_errors(
     """Refine poles, B, K and C on u (N, m), y (N, l); return (model, K (n, l)).
 
     Minimises the sum of squares of the whitened innovations in at most `most` steps; it stays among stable
-    models with positive poles. Raises InputError for a model that is not diagonal (`statespace.modal`).
-    """
+    models with positive poles. Raises InputError for a model that is not diagonal (`statespace.modal`)."""
     if np.abs(model.a - np.diag(np.diag(model.a))).max() > 1e-12:
         raise InputError("prediction-error refinement starts from a model with real poles (diagonal A)")
     n, m, l = model.order, model.b.shape[1], len(model.c)  # noqa: E741

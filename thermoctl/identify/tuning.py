@@ -264,8 +264,7 @@ def controller_at(w: np.ndarray, gains: Gains, period_s: float) -> np.ndarray:
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
     """Return the margins of PID (41) at `period_s` on the model with a zero-order hold.
 
-    The moving average of `moving_average` samples is included.
-    """
+    The moving average of `moving_average` samples is included."""
     w, plant = _plant(model, period_s, moving_average)
     loop = controller_at(w, gains, period_s) * plant
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))

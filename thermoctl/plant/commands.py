@@ -60,8 +60,7 @@ def _warn_of_tables(plant: Plant, recording: str, last: float) -> None:
 def simulate(args: argparse.Namespace, read: Reader | None = None) -> int:
     """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
-    `read`: reads recordings. Prints figures; writes a file and a plot on request.
-    """
+    `read`: reads recordings. Prints figures; writes a file and a plot on request."""
     plant = load(args.plant, args.map)
     initial = _initial(plant, args)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []

@@ -36,8 +36,7 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
     """Return vertices (kind, key, label) and edges (from, to, kind, label).
 
     A node has one satellite for its inflows, one for its outflows and one for its readings. A reading of
-    several nodes is a vertex of its own.
-    """
+    several nodes is a vertex of its own."""
     vertices = [("node", n.name, f"{n.name}\n[{n.unit}]" if n.unit else n.name) for n in plant.nodes.values()]
     index = {n: i for i, n in enumerate(plant.nodes)}
     edges: list[Edge] = []
@@ -80,8 +79,7 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
     """Return the intersection of the line from `outside` (2,) to `inside` (2,) with the box round `inside`.
 
-    box: [[left, bottom], [right, top]].
-    """
+    box: [[left, bottom], [right, top]]."""
     way = outside - inside
     room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
     return inside + way * min(float(room.min()), 1.0)

@@ -86,8 +86,7 @@ def info(path: str | Path) -> Info:
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
     """Return (ticks (n, signals) in the order of its rig's signals, text `law` of the metadata) for a replay.
 
-    Raises InputError when a signal is missing (a tier, or a recording of another version).
-    """
+    Raises InputError when a signal is missing (a tier, or a recording of another version)."""
     table = read_table(path)
     if "10 Hz" in table.meta.get("tier", ""):
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
@@ -105,8 +104,7 @@ def recover(path: str | Path, out: str | Path) -> Info:
     """Copy the complete batches of a truncated recording to `out` and close it properly.
 
     Any Arrow reader opens the copy; its summary is returned. Raises InputError when nothing can be read or
-    `out` exists.
-    """
+    `out` exists."""
     path, out = Path(path), Path(out)
     stream = open_stream(path)
     for _ in stream:

@@ -32,8 +32,7 @@ FRESH_PER_WORD, STATUS_PER_WORD, DELAYS_PER_WORD = 52, 26, 13
 class Signal:
     """One column of a recording: `unit` as pint reads it ('1' for a number), plausible from `low` to `high`.
 
-    `bits`: a word of bits; rows are merged by OR.
-    """
+    `bits`: a word of bits; rows are merged by OR."""
 
     name: str
     unit: str
@@ -107,8 +106,7 @@ class Row:
     """The record row of a rig: its signals, their index, and where its parts lie.
 
     Slices: `readings` (all channels), `measured` (the points among them), `estimates` (of the points), and
-    the words of bits `fresh`, `status`, `delay`.
-    """
+    the words of bits `fresh`, `status`, `delay`."""
 
     def __init__(self, channels: Channels):
         self.channels = channels

@@ -34,8 +34,7 @@ def make_backend(settings: Settings, board: Board | None = None) -> Backend:
 def make_backends(settings: Settings, board: Board | None = None) -> list[Backend]:
     """Make the back end of each axis, not yet open; of a rig without axes the only one. See make_backend.
 
-    Devices are opened once, with the first of them, and read once a tick, by the first of them.
-    """
+    Devices are opened once, with the first of them, and read once a tick, by the first of them."""
     if not isinstance(settings.channels, AxesChannels):
         return [make_backend(settings, board)]
     if settings.hal.backend != "devices":

@@ -47,8 +47,7 @@ def span(seconds: float | None) -> str:
 def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the faults as lines of a terminal.
 
-    Each cause has its time, its devices' messages and its remedy; its consequences follow.
-    """
+    Each cause has its time, its devices' messages and its remedy; its consequences follow."""
     lines: list[str] = []
     listed = list(standing)
     for f in listed:
@@ -74,8 +73,7 @@ def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
 def value_lines(status: Mapping[str, Any]) -> list[str]:
     """List a status' values as lines of a terminal.
 
-    An invalid value is '-' with its state and age.
-    """
+    An invalid value is '-' with its state and age."""
     by_role = status["readings"]
     shown_or = {
         name: number(status[name], 3)
@@ -118,8 +116,7 @@ def message_lines(status: Mapping[str, Any]) -> list[str]:
     """List a line for each invalid reading, with its device's message.
 
     In FAULT also readings that are valid again are listed. Then comes what cannot be saved, and the drive's
-    newest error code.
-    """
+    newest error code."""
     lines = []
     for role, r in status["readings"].items():
         said = f": {r['message']} (since {clock(r['message_wall_s'])})" if r["message"] else ""

@@ -50,8 +50,7 @@ from thermoctl_hal.rig.make import (
 def check(settings: Settings) -> int:
     """Check the configuration, the model, the plant and the profiles; no hardware is touched.
 
-    Returns 1 where the rig could never be armed.
-    """
+    Returns 1 where the rig could never be armed."""
     with _drivers(settings):
         make_backends(settings)  # back ends of all axes
     return _each_axis(settings, _check) if settings.axes else _check(settings)

@@ -25,8 +25,7 @@ class Simulation:
     `row` is the newest record row (`settings.row` has its signals), `law` the control law,
     `backend` the open back end.
     The setting hal.backend must be simulated. `model`, `parameters` and
-    `backend`: those of the settings if None.
-    """
+    `backend`: those of the settings if None."""
 
     def __init__(
         self,
@@ -61,8 +60,7 @@ class Simulation:
     def command(self, name: str, value: float = 0.0) -> None:
         """Give arm, disarm, or setpoint (um) for the next tick.
 
-        Raises RuntimeError when the mailbox is full.
-        """
+        Raises RuntimeError when the mailbox is full."""
         if not self.mailbox.push(COMMANDS[name], float(value)):
             raise RuntimeError("more commands than the mailbox holds: let it tick")
 
@@ -74,8 +72,7 @@ class Simulation:
     def tick(self, count: int = 1) -> np.ndarray:
         """Run `count` ticks; return the newest row (a view).
 
-        Without `publish` only the last row is made.
-        """
+        Without `publish` only the last row is made."""
         rig, law, period_s = self.rig, self.law, self.period_s
         for left in range(count - 1, -1, -1):
             self.ticks += 1
@@ -117,8 +114,7 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
     """Move in trapezoids of 75 s (the paper's test 4B); print mean and largest deviation of the output.
 
     The reference encoder, which the law never reads, measures it while the reference has stood for SETTLE_S.
-    out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1.
-    """
+    out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1."""
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)
     simulation.arm()

@@ -48,8 +48,7 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
     """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
 
     Returns 1 when a fault is active at the end, 3 when the daemon did not start. Raises InputError for a
-    rig that is not simulated, and while another demo runs here.
-    """
+    rig that is not simulated, and while another demo runs here."""
     if settings.hal.backend != "simulated":
         raise InputError(
             f"{settings.path}: demo moves a simulated rig only, and this one's back end is '{settings.hal.backend}'; "
@@ -76,8 +75,7 @@ def demo_folder(settings: Settings) -> Path:
 def _own(settings: Settings) -> Any:
     """Write the configuration of the demo into its folder: this rig, with files of its own.
 
-    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it.
-    """
+    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it."""
     folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
     make_folder(folder)
     hal = settings.hal
@@ -138,8 +136,7 @@ class _Demo:
         """Arm, move and show the rig for `seconds`, or until q is pressed; return the exit status.
 
         1: a fault in the last status (warnings do not count), or the child has ended. 3: the child was not
-        READY within START_S. Raises InputError when arming is refused or the child has lost its lock.
-        """
+        READY within START_S. Raises InputError when arming is refused or the child has lost its lock."""
         if not self._ready():
             sys.stderr.write(self.child.said())
             return 3

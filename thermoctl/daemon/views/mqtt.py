@@ -30,8 +30,7 @@ class Bridge:
     """Asks the daemon of `settings` and publishes below `topic`.
 
     broker: HOST or HOST:PORT (default 1883, with `tls` 8883); user, password: where the broker asks for
-    them.
-    """
+    them."""
 
     def __init__(
         self,

@@ -93,8 +93,7 @@ class Watch:
 
     frame: the newest one, a dict ready for JSON; `wait(seen)` returns (number, frame) as soon as its
     number is not `seen`. captures: newest last. past: the last minute, {state, PAST signals} every tenth
-    of a second, oldest first.
-    """
+    of a second, oldest first."""
 
     def __init__(self, settings: Settings, rate_hz: float = 20.0):
         self.settings, self.rate_hz = settings, rate_hz
@@ -244,8 +243,7 @@ class Watch:
     def _keep(self, rows: np.ndarray, lost: int) -> None:
         """Add rows to open captures; begin one for each new fault that trips.
 
-        lost: ticks missing before `rows`, because this process fell behind by more than the ring's length.
-        """
+        lost: ticks missing before `rows`, because this process fell behind by more than the ring's length."""
         if lost:
             self._recent.clear()
         for capture in self.captures:
