@@ -53,7 +53,7 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
     for name in ("test_2", "test_3", "test_4a"):
         assert cli.main(["experiment", name, "--config", "rig.yaml"]) == 0
     said = capsys.readouterr().out
-    assert "faster than real time" in said and "mHz" in said and "<- f_c" in said
+    assert "faster than real time" in said and "alternating power below f_c" in said
     table = read_table("test_2.parquet")
     assert (
         len(table) == pytest.approx(2200, abs=2)
@@ -83,9 +83,7 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
     # The daemon's own loader takes it by the folder, and refuses it for a rig of another name.
     (quick / "rig.yaml").write_text((quick / "rig.yaml").read_text().replace('model: ""', "model: models"))
     settings = load_settings("rig.yaml")
-    assert (
-        np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I) and found.figures["refinement"]
-    )
+    assert np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I)
     other = dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, name="another"))
     with pytest.raises(InputError, match="of rig 'simulated', this one is 'another'"):
         compensator(other)

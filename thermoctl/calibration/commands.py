@@ -79,8 +79,7 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str | 
     settings = load_settings(config)
     points = settings.channels.point_names
     r2, r3, r4 = (recorded.read(p, points) for p in (test_2, test_3, test_4a))
-    thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
-    print(f"prediction-error refinement: {refined}")
+    thermal, kalman, variances, um = chain.calibrate([r2, r3, r4], order or None)
     model = chain.compensator(kalman, um, settings.loop.period_s, points=points)
     left = r4.error_um - um.predict(
         chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info["start_um"]
@@ -89,7 +88,6 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str | 
         "time_constants_s": thermal.info["time_constants_s"],
         "residual_rms_k": thermal.info["residual_rms"],
         "variances": variances,
-        "refinement": refined,
     }
     figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
     folder = _models(models, settings)
