@@ -6,7 +6,8 @@ It loads neither numpy nor the loop.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from thermoctl.daemon.answers.sources import FIXED_SOURCES
@@ -146,6 +147,12 @@ def counter_lines(status: Mapping[str, Any]) -> list[str]:
         for device, counts in status.get("device_counters", {}).items()
         if any(count for name, count in counts.items() if name not in _NORMAL)
     ]
+
+
+def between(bins: Iterable[Sequence[float]], edges: Sequence[float]) -> list[float]:
+    """Return the counts of a histogram, (us, count) each, between neighbouring edges."""
+    bins = list(bins)
+    return [sum(count for us, count in bins if low <= us < high) for low, high in pairwise(edges)]
 
 
 def clock(wall_s: float) -> str:

@@ -23,6 +23,7 @@ from thermoctl.daemon.answers.display import (
     EXPECTED,
     FREE,
     MEASURED,
+    between,
     fault_lines,
     message_lines,
     number,
@@ -227,11 +228,7 @@ def _trails(trails: dict[str, deque[float]], width: int, ramp: str) -> Table:
 
 def _timing(latency: dict[str, Any], ramp: str) -> Text:
     late, busy = latency["lateness"], latency["busy"]
-    bins: list[Sequence[float]] = late["bins_us"]
-    edges = (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf)
-    counts = [
-        sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)
-    ]
+    counts = between(late["bins_us"], (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf))
     shape = sparkline([math.log1p(c) if c else math.nan for c in counts], len(counts), ramp)
     return Text.assemble(
         ("lateness      ", "dim"),

@@ -23,7 +23,7 @@ import numpy as np
 
 from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN
+from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN, between
 from thermoctl.daemon.answers.readings import finite, hide_invalid, invalid
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.tick.assemble import compensator, rig_identity, shared_name
@@ -158,11 +158,7 @@ class Watch:
         answer = latency(shared, self.settings.loop.period_s)
         for name in ("lateness", "busy", "reference"):
             bins = answer[name].pop("bins_us")
-            edges = (*LATENESS_EDGES_US, math.inf)
-            answer[name]["counts"] = [
-                sum(c for us, c in bins if low <= us < high)
-                for low, high in zip(edges[:-1], edges[1:], strict=True)
-            ]
+            answer[name]["counts"] = between(bins, (*LATENESS_EDGES_US, math.inf))
         return {**answer, "edges_us": list(LATENESS_EDGES_US)}
 
     def _attached(self) -> Shared | None:

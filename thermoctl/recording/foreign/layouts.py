@@ -44,11 +44,9 @@ def special(path: Path, text: bytes) -> list[Sheet] | None:
     return None
 
 
-def _sheet(
-    path: Path, columns: Mapping[str, Sequence[Any]], place: Callable[[int], str], name: str = ""
-) -> Sheet:
+def _sheet(columns: Mapping[str, Sequence[Any]], place: Callable[[int], str]) -> Sheet:
     texts = {n: pa.array(["" if v is None else _word(v) for v in c], pa.string()) for n, c in columns.items()}
-    return Sheet(dict(texts), place, name=name)
+    return Sheet(dict(texts), place)
 
 
 def _word(value: Any) -> str:
@@ -59,7 +57,7 @@ def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
     records = [_flat(r) for r in records]
     names = list(dict.fromkeys(k for r in records for k in r))
     columns = {n: [r.get(n) for r in records] for n in names}
-    return _sheet(path, columns, place_in(path, "record"))
+    return _sheet(columns, place_in(path, "record"))
 
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -135,7 +133,7 @@ def _lists(path: Path, content: Mapping[str, Any]) -> Sheet | None:
     rows = max((n for n in lengths if lengths.count(n) > 1), default=0)
     if not rows:
         return None
-    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
+    sheet = _sheet({k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
     sheet.notes += [
         f"list '{k}' left out: {len(v)} items; the others have {rows}"
         for k, v in lists.items()
@@ -166,9 +164,7 @@ def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
         names = content[0] if rows is not content else [f"column_{i + 1}" for i in range(len(rows[0]))]
         plain = not any(isinstance(y, dict | list) for x in rows for y in x)
         if plain and {len(x) for x in rows} == {len(set(names))} != {1}:
-            return [
-                _sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))
-            ]
+            return [_sheet(dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))]
     return None
 
 
@@ -254,7 +250,7 @@ def _tektronix(path: Path, text: str) -> list[Sheet] | None:
     facts = {r[0].lower(): r[1] for r in rows if r[0]}
     name = facts.get("source", "CH1") or "CH1"
     sheet = _sheet(
-        path, {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
+        {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
     )
     units = {"TIME": spelled(facts.get("horizontal units", "s")), name: spelled(facts.get("vertical units"))}
     sheet.units = {k: v for k, v in units.items() if v}
