@@ -40,7 +40,7 @@ def run_experiment(
     With a running daemon it runs in real time under the daemon's protections. Without one it runs on the
     simulated back end, faster than real time. An experiment of inputs can also run on a plant file. Returns 1
     when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there."""
-    if experiment.lists_inputs(name):
+    if Path(name).suffix in (".yaml", ".yml"):  # the file of an experiment, not a test of the rig
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
             return experiment.on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))

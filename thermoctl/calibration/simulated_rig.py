@@ -39,12 +39,6 @@ def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
     return dataclasses.replace(settings, compensation=compensation, protection=protection)
 
 
-def with_gains(settings: Settings, gains: Gains) -> Settings:
-    """Set other gains of the position loop."""
-    control = dataclasses.replace(settings.control, kp=gains.kp, ti_s=gains.ti_s, td_s=gains.td_s)
-    return dataclasses.replace(settings, control=control)
-
-
 class SimulatedRig:
     """The configuration's simulated back end, in this process, each test from rest."""
 
@@ -116,7 +110,8 @@ class SimulatedRig:
         try:
             if gains is not None:
                 simulation.arm()
-                simulation.reload(law_parameters(with_gains(settings, gains)))
+                tried = dataclasses.replace(settings.control, kp=gains.kp, ti_s=gains.ti_s, td_s=gains.td_s)
+                simulation.reload(law_parameters(dataclasses.replace(settings, control=tried)))
                 simulation.tick()
             every = max(1, round(every_s / simulation.period_s))
             yield from play(simulation, schedule, every, progress, stop)

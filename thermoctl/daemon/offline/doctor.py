@@ -193,20 +193,16 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
             count, most_hz = max(count, found.frames[f"{name}.frames"]), math.inf
         rate_hz = count / seconds
         problem = backend.problem(role) or slow(role, rate_hz, expected, most_hz)
+        if not problem and role == "amplifier_state" and sample.value[k] in range(len(AMPLIFIER_STATES)):
+            problem = AMPLIFIER_STATES[int(sample.value[k])]
         of = f" of {expected[role]:g}" if role in expected else ""
         print(
             f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f}{of} Hz"
-            + (f"   {problem or _in_words(role, sample.value[k])}".rstrip())
+            + f"   {problem}".rstrip()
         )
     if counters := backend.counters():
         print("counters: " + ", ".join(f"{name} {count}" for name, count in counters.items()))
     return bad
-
-
-def _in_words(role: str, value: float) -> str:
-    """Return what the amplifier's state means, '' for other channels."""
-    has_words = role == "amplifier_state" and value in range(len(AMPLIFIER_STATES))
-    return AMPLIFIER_STATES[int(value)] if has_words else ""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import math
 import textwrap
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
