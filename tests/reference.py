@@ -18,9 +18,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+from tests.acts import ACTS
 from thermoctl.cli import parser
 from thermoctl.configuration.settings import SECTIONS, options
-from thermoctl.configuration.which_rig import ACTS
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault
 from thermoctl.daemon.reload import IN_STEPS

@@ -92,11 +92,8 @@ SPELLINGS = {
     "Pa": "pascal",
 }
 """Unit: its spellings by loggers and in device files, in lower case, separated by |."""
-_KELVIN = {
-    "K": (1.0, 0.0),
-    "degC": (1.0, 273.15),
-    "degF": (5 / 9, 459.67 * 5 / 9),
-}  # scale, offset to kelvins
+# Scale and offset to kelvins.
+_KELVIN = {"K": (1.0, 0.0), "degC": (1.0, 273.15), "degF": (5 / 9, 459.67 * 5 / 9)}
 _BASES = {
     "[length]": "m",
     "[mass]": "kg",

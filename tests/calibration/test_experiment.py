@@ -53,7 +53,7 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
     for name in ("test_2", "test_3", "test_4a"):
         assert cli.main(["experiment", name, "--config", "rig.yaml"]) == 0
     said = capsys.readouterr().out
-    assert "faster than real time" in said and "mHz" in said and "<- f_c" in said
+    assert "faster than real time" in said and "alternating power below f_c" in said
     table = read_table("test_2.parquet")
     assert (
         len(table) == pytest.approx(2200, abs=2)
@@ -83,9 +83,7 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
     # The daemon's own loader takes it by the folder, and refuses it for a rig of another name.
     (quick / "rig.yaml").write_text((quick / "rig.yaml").read_text().replace('model: ""', "model: models"))
     settings = load_settings("rig.yaml")
-    assert (
-        np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I) and found.figures["refinement"]
-    )
+    assert np.array_equal(compensator(settings).A_minus_I, found.model.A_minus_I)
     other = dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, name="another"))
     with pytest.raises(InputError, match="of rig 'simulated', this one is 'another'"):
         compensator(other)
@@ -125,9 +123,9 @@ def test_experiment_refuses_what_the_rig_may_not_do(quick, capsys):
     )
 
 
-def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out(quick, capsys):
-    """The margin measured with the shipped gains is where the loop becomes unstable; --write proves each step and takes no unstable gains."""
-    assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "imc"]) == 0
+def test_tune_names_the_shipped_loops_margins_and_proves_its_proposal(quick, capsys):
+    """The margin measured with the shipped gains is where the loop becomes unstable; --write proves each step."""
+    assert cli.main(["tune", "--config", "rig.yaml", "--write"]) == 0
     said = capsys.readouterr().out
     gain = float(re.search(r"present: gain margin ([\d.]+)", said)[1])
     settings = load_settings("rig.yaml")
@@ -147,11 +145,6 @@ def test_tune_names_the_shipped_loops_margins_and_keeps_an_unstable_proposal_out
         return state != 3
 
     assert not trips(0.01 * gain * 0.9) and trips(0.01 * gain * 1.1)
-    before = (quick / "rig.yaml").read_bytes()
-    assert cli.main(["tune", "--config", "rig.yaml", "--write", "--method", "zn"]) == 2
-    said, err = capsys.readouterr()
-    assert "UNSTABLE" in said and "not tried on the rig" in err and "not proposed" in said
-    assert (quick / "rig.yaml").read_bytes() == before
 
 
 def test_a_wrong_expansion_is_tuned_while_the_reference_is_there(quick, monkeypatch):

@@ -1,6 +1,6 @@
 """Every command that can move, arm, disarm or stop a rig, beside a daemon that somebody else runs in READY, ARMED and FAULT.
 
-The table is which_rig.ACTS; docs/reference/commands-that-act.md is written from it.
+The table is tests/acts.py; docs/reference/commands-that-act.md is written from it.
 """
 
 import io
@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.acts import ACTS
 from tests.daemon.process import ROOT, Daemon, patient, wait
 from tests.simulated import rig_file
 from thermoctl import cli
-from thermoctl.configuration.which_rig import ACTS
+from thermoctl.configuration.which_rig import ACTING
 from thermoctl.daemon import lock
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -172,6 +173,6 @@ def test_a_command_that_is_meant_is_refused_where_the_table_says_so(foreign, cap
 
 
 def test_every_command_of_the_table_is_tried_and_exists():
-    assert set(BESIDE) == {act.command for act in ACTS}
+    assert set(BESIDE) == {act.command for act in ACTS} == ACTING
     for act in ACTS:
         cli.parser().parse_args([act.command, *BESIDE[act.command][0]])

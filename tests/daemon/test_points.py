@@ -22,7 +22,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.reader import read_rows
 from thermoctl.recording.writer import FULL, RecordingWriter, recording_files
 from thermoctl.rig.channels import DEFAULT, MAX_POINTS, of_text
-from thermoctl.rig.signals import AT, of_channels, recorded_states
+from thermoctl.rig.signals import AT, of_channels
 from thermoctl_hal.virtual.rig import VirtualRig
 
 SPINDLE = ("motor", "spindle_front_bearing", "rear_bearing", "frame")
@@ -186,15 +186,6 @@ def test_a_wrong_declaration_is_one_message(tmp_path, points, why):
     path.write_text("\n".join([*lines[:begin], f"points: {points}", *lines[begin + 5 :]]))
     with pytest.raises(InputError, match=why):
         load_settings(path)
-
-
-def test_the_states_of_an_older_recording():
-    """Before `points`, the channels were: four of the axis, the air, the twelve points, the amplifier's three."""
-    old = {"voltage_v": 2, "air_c": 4, "coil_c": 5, "bracket_2_c": 16, "supply_v": 17, "amplifier_fault": 19}
-    assert len(recorded_states({"status_bits": np.zeros(1)}, {})) == 20
-    for role, place in old.items():
-        states = recorded_states({"status_bits": np.array([float(2 << 2 * place)])}, {})
-        assert [r for r, state in states.items() if state[0] == 2] == [role]
 
 
 def test_too_many_points(tmp_path):

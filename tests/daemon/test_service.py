@@ -12,7 +12,7 @@ import pytest
 
 from tests.daemon.process import ROOT, Daemon
 from thermoctl.cli import main
-from thermoctl.cli.manual import PLACES
+from thermoctl.cli.completion import PLACES
 from thermoctl.configuration.settings import load_settings
 from thermoctl.daemon import lock, service
 from thermoctl.files.yamlfile import InputError
@@ -164,7 +164,7 @@ def test_a_second_rig_gets_a_unit_of_its_own(installed, config, tmp_path, capsys
     assert "rig.name 'axis 2'" in capsys.readouterr().err
     assert main(["service", "uninstall", *root]) == 1 and "which unit?" in capsys.readouterr().err
     assert main(["service", "uninstall", "--config", str(other), *root]) == 0
-    assert first.read_text() == before and (installed / PLACES["man"]).exists()
+    assert first.read_text() == before and (installed / PLACES["bash"]).exists()
     assert main(["service", "uninstall", "--config", str(config), *root]) == 0
     assert not [p for p in installed.rglob("*") if p.is_file()]
 

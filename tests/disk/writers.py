@@ -333,6 +333,5 @@ def writers() -> list[Writer]:
         Writer("init", _init),
         Writer("demo: its configuration", _demo, _demo),
         Writer("service install", _service, _rig),
-        commanded("manual install", "manual", "install", "--root", "root"),
         Writer("devices new", _new_device),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The simulated, the replayed and the spoiled rig."""
+"""The simulated and the spoiled rig."""
 
 import math
 from pathlib import Path
@@ -26,7 +26,6 @@ from thermoctl_hal.base.backend import (
 )
 from thermoctl_hal.rig.make import make_backend
 from thermoctl_hal.simulated.faulty import FaultInjector, schedule
-from thermoctl_hal.simulated.replay import ReplayBackend
 
 POSITION, COIL, AIR, STATE = (ROLE[r] for r in ("position_um", "coil_c", "air_c", "amplifier_state"))
 
@@ -125,52 +124,6 @@ def test_not_finite_or_not_enabled_is_no_drive(tmp_path):
 def test_mistakes_in_the_simulated_rig_are_named(tmp_path, hal, message):
     with pytest.raises(InputError, match=message):
         make_backend(make_settings(tmp_path, **hal))
-
-
-def recording(**columns):
-    n = len(next(iter(columns.values())))
-    return Table(
-        "r", "r.csv", 100.0 + np.arange(n) * 0.01, {k: np.array(v, float) for k, v in columns.items()}
-    )
-
-
-def test_replay_gives_the_recorded_samples_at_their_times():
-    backend = ReplayBackend(
-        recording(q=[1e-6, 2e-6, 3e-6, 4e-6], coil_c=[20, math.nan, 21, math.nan], x=[0, 0, 0, 0]),
-        {"q": "position_um [m]"},
-    )
-    backend.open()
-    seen = []
-    for k in range(8):  # two reads for each row
-        s = backend.read(5.0 + k * 0.005)
-        seen.append((s.value[POSITION], s.fresh[POSITION], s.value[COIL], s.fresh[COIL]))
-    assert seen[::2] == [(1, True, 20, True), (2, True, 20, False), (3, True, 21, True), (4, True, 21, False)]
-    assert not any(f for _, f, _, g in seen[1::2] for f in (f, g))
-    assert s.time_s[COIL] == pytest.approx(5.02)
-    s = backend.read(5.1)
-    assert backend.finished and s.status[POSITION] == STALE and "has ended" in backend.problem("position_um")
-
-
-def test_replay_skips_to_the_newest_when_the_reader_is_slow():
-    backend = ReplayBackend(recording(position_um=range(100)), {})
-    backend.open()
-    backend.read(0.0)
-    assert backend.read(0.505).value[POSITION] == 50
-
-
-@pytest.mark.parametrize(
-    "columns,roles,message",
-    [
-        ({"x": [1, 2]}, {}, "no column plays a role"),
-        ({"x": [1, 2]}, {"y": "coil_c"}, "no column 'y'"),
-        ({"x": [1, 2]}, {"x": "coil"}, "'coil' is no role.*did you mean 'coil_c'"),
-        ({"x": [1, 2]}, {"x": "coil_c [furlong]"}, "takes degC or K"),
-        ({"x": [1, 2], "coil_c": [1, 2]}, {"x": "coil_c"}, "coil_c to two columns"),
-    ],
-)
-def test_mistakes_in_a_replay_are_named(columns, roles, message):
-    with pytest.raises(InputError, match=message):
-        ReplayBackend(recording(**columns), roles)
 
 
 class Source:
@@ -311,5 +264,5 @@ def test_a_tick_makes_no_arrays(tmp_path):
 
 
 def test_settings_without_a_backend_are_refused():
-    with pytest.raises(ValueError, match="simulated, devices or replay"):
+    with pytest.raises(ValueError, match="simulated or devices"):
         make_backend(SimpleNamespace(hal=SimpleNamespace(backend="other"), path=str(Path())))

@@ -8,7 +8,7 @@ from scipy import signal
 
 from tests.identify.peers import identify_validated, initial_state
 from thermoctl.files.yamlfile import InputError
-from thermoctl.identify import modal, refine
+from thermoctl.identify import modal
 from thermoctl.identify.statespace import StateSpace
 
 TAU = np.array([20.0, 150.0, 900.0])
@@ -157,16 +157,6 @@ def test_a_noise_pole_is_refused_with_its_value():
     m = StateSpace(np.diag([0.99, -0.3]), np.ones((2, 1)), np.eye(2), 10.0, np.zeros(2))
     with pytest.raises(InputError, match="pole at -0.3"):
         m.resample(0.001)
-
-
-def test_prediction_error_refinement_lowers_the_prediction_error(data):
-    u, _, noisy = data
-    u, y = modal.reduce((u, noisy), 1.0).u[:, :, 0] / np.sqrt(10), modal.reduce((u, noisy), 1.0).y
-    start = modal.identify(modal.reduce((u, y), 10.0, 10.0), 3)
-    gain = refine.prediction_gain(start, u, y)
-    before = np.sum(refine.innovations(start, u, y, gain) ** 2)
-    m, gain = refine.by_prediction_errors(start, u, y, 4)
-    assert m.stable and np.sum(refine.innovations(m, u, y, gain) ** 2) <= before
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.recorded import Recorded, of_columns
 from thermoctl.calibration.schedules import of_config
-from thermoctl.calibration.simulated_rig import with_model
+from thermoctl.calibration.simulated_rig import play, with_model
 from thermoctl.configuration.settings import load_settings
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.offline.simulate import Simulation
@@ -48,7 +48,7 @@ def run_test(
     simulation = Simulation(with_model(settings, model), model)
     try:
         test = dataclasses.replace(test, duration_s=part * test.duration_s)
-        return np.vstack(list(experiments.run(simulation, test, every)))
+        return np.vstack(list(play(simulation, test, every)))
     finally:
         simulation.close()
 

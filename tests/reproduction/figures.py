@@ -97,7 +97,7 @@ def _errors(r: Recorded, estimates: Mapping[str, np.ndarray], caption: str) -> s
         top.plot(r.t / 3600, truth[:, j], lw=1, label=POINTS[j].replace("_", " "))
     top.set(ylabel="rise, K")
     for ax, (name, estimate) in zip(rest, estimates.items(), strict=True):
-        error = chain.block_mean(estimate - truth, 60)
+        error = paper.block_mean(estimate - truth, 60)
         ax.plot((np.arange(len(error)) + 0.5) / 60, error[:, list(SHOWN)], lw=1)
         ax.axhline(0, color="0.6", lw=0.6)
         ax.set(ylabel=f"{name}, K")
@@ -120,8 +120,8 @@ def _motion(r: Recorded) -> str:
 def _gain(c: paper.Calibration, r: Recorded) -> str:
     fig, (a, b) = _axes(2)
     q = round(c.mkf.period_s)
-    coil = chain.block_mean(filled(chain.rises(r)[:, :1]), q)[:, 0]
-    t, k = c.mkf.run(chain.block_mean(r.power_w[:, None], q)[:, 0], coil)
+    coil = paper.block_mean(filled(chain.rises(r)[:, :1]), q)[:, 0]
+    t, k = c.mkf.run(paper.block_mean(r.power_w[:, None], q)[:, 0], coil)
     a.plot(k[:30], "o-")
     a.set(xlabel="sample", ylabel="gain")
     b.plot(np.arange(len(t)) * q / 3600, coil - t[:, 0], lw=0.5)

@@ -30,7 +30,6 @@ from thermoctl.calibration.chain import (
     AIR_FILTER_S,
     NOISE_K,
     STEP_K,
-    block_mean,
     fit_expansion,
     rises,
     run_kalman,
@@ -51,6 +50,11 @@ Q0 = 1e6  # Q(0) of recursion (5), times the identity
 ROWS = {1: (30, 40, 50), 2: (15, 20, 30, 40), 3: (15, 20, 30), 4: (15, 20, 30, 40), 6: (15, 20), 8: (15, 20)}
 CHOICES = [(period_s, i) for period_s, rows in ROWS.items() for i in rows]
 ESTIMATORS = ("siso", "paper", "better", "twelve")
+
+
+def block_mean(v: np.ndarray, q: int) -> np.ndarray:
+    """Average over blocks of q rows; drop an incomplete last block."""
+    return v[: len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
 
 
 def factor(u: np.ndarray, y: np.ndarray, i: int) -> np.ndarray:

@@ -99,7 +99,7 @@ def _figures(residual: np.ndarray) -> MeanTwoS:
 def _rises(c: paper.Calibration, r: Recorded) -> dict[str, np.ndarray]:
     """Estimate the rises over a test: the paper's model alone, its MKF, the better filter."""
     q = round(c.paper_model.period_s)
-    simulated = c.paper_model.simulate(chain.block_mean(r.power_w[:, None], q))
+    simulated = c.paper_model.simulate(paper.block_mean(r.power_w[:, None], q))
     return {
         "open loop": paper.held(simulated, q, len(r.t)),
         "paper": paper.estimate(c.mkf, r),

@@ -134,7 +134,7 @@ def run(case, seed, folder):
     present, outcome, why = (case.kp, case.ti_s, case.td_s), "refused", ""
     gains = present
     try:
-        found = tune(LoopRig(settings, case.truth, seed), "imc", True, Keyboard(False), lambda line: None)
+        found = tune(LoopRig(settings, case.truth, seed), True, Keyboard(False), lambda line: None)
         gains = (found.proposed.kp, found.proposed.ti_s, found.proposed.td_s)
         outcome = "kept" if found.proposed == found.present else "written"
     except (InputError, HardwareError) as e:

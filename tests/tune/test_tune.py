@@ -22,7 +22,7 @@ ROWS = max(INDEX.values()) + 1
 
 
 def tuned(rig, said=None):
-    return tune(rig, "imc", True, Keyboard(False), (said if said is not None else []).append)
+    return tune(rig, True, Keyboard(False), (said if said is not None else []).append)
 
 
 @pytest.mark.parametrize("seed", [1])

@@ -53,7 +53,12 @@ class Refit:
 
     def residuals(self, output: str) -> np.ndarray:
         """Return one output's residuals of all recordings, one after the other, without missing samples."""
-        j = self._output(output)
+        outputs = self.fit.model.outputs
+        if output not in outputs:
+            raise InputError(
+                f"'{output}' is not an output{suggest(output, outputs)}; {', '.join(outputs)} are"
+            )
+        j = outputs.index(output)
         e = np.concatenate([r[:, j] for r in self.fit.residuals])
         return e[np.isfinite(e)]
 
@@ -102,14 +107,6 @@ class Refit:
             else None
         )
         return profile_curve(*self.profile(parameter), parameter, unit)
-
-    def _output(self, output: str) -> int:
-        if output not in self.fit.model.outputs:
-            outputs = self.fit.model.outputs
-            raise InputError(
-                f"'{output}' is not an output{suggest(output, outputs)}; {', '.join(outputs)} are"
-            )
-        return self.fit.model.outputs.index(output)
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{n} = {e.value:.5g} ± {e.sd:.2g}" for n, e in self.parameters.items())

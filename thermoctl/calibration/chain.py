@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg, signal
 
-from thermoctl.calibration.recorded import Recorded, filled
+from thermoctl.calibration.recorded import Recorded
 from thermoctl.control.model import CompensatorModel
-from thermoctl.identify import expansion, filter, modal, refine
+from thermoctl.identify import expansion, filter, modal
 from thermoctl.identify.statespace import StateSpace
 
 STEP_K, NOISE_K = 0.25, 0.06  # resolution and noise of a thermocouple's reading
@@ -48,63 +48,15 @@ def air_rate(air_c: np.ndarray) -> np.ndarray:
     return np.append(np.diff(a), 0.0)
 
 
-def block_mean(v: np.ndarray, q: int) -> np.ndarray:
-    """Average over blocks of q rows; drop an incomplete last block."""
-    return v[: len(v) // q * q].reshape(len(v) // q, q, -1).mean(1)
-
-
 def calibrate(
-    tests: list[Recorded], order: int | None = None, model: StateSpace | None = None
+    tests: list[Recorded], order: int | None = None
 ) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion]:
-    """Calibrate the estimator from any tests.
-
-    Return model, filter, its variances and expansion. `model`: a given thermal model, else it is identified.
-    """
-    model = model or identify(tests, order)
+    """Calibrate the estimator from any tests; return model, filter, its variances and expansion."""
+    model = identify(tests, order)
     plant = filter.disturbed(filter.with_air(model))
     records = [filter.Record(t.power_w, air_rate(t.air_c), rises(t)) for t in tests]
     kalman, variances = filter.tune(plant, records, filter.sensor_variance(STEP_K, NOISE_K))
     return model, kalman, variances, fit_expansion(kalman, tests)
-
-
-def calibrate_refined(
-    tests: list[Recorded], order: int | None = None
-) -> tuple[StateSpace, filter.Kalman, np.ndarray, expansion.Expansion, str]:
-    """Calibrate with and without refining the thermal model by its prediction errors.
-
-    The model is refined on all tests but the last. Return the one that predicts the thermometers of the last
-    test better, and a sentence that compares both.
-    """
-    plain = calibrate(tests, order)
-    refined_model = refine_model(plain[0], tests[:-1])
-    if refined_model is plain[0]:
-        return *plain, "no better in its own criterion; left out"
-    refined = calibrate(tests, order, refined_model)
-    last = rises(tests[-1])
-    a, b = (
-        float(np.sqrt(np.nanmean((run_kalman(k, tests[-1]) - last) ** 2))) for k in (plain[1], refined[1])
-    )
-    compared = f"{b:.4f} K rms with, {a:.4f} K without, over the test that it was not refined on"
-    return (*refined, compared + "; taken") if b < a else (*plain, compared + "; left out")
-
-
-def refine_model(model: StateSpace, tests: list[Recorded]) -> StateSpace:
-    """Refine poles, B and C by prediction errors, without the air's own changes.
-
-    Blocks of 10 s are used, one test after the other. Return the model itself where nothing improves."""
-    slow = model.resample(10.0)
-    air = with_air_alone(model)
-    for t in tests:
-        y = block_mean(filled(rises(t)) - air.simulate(air_rate(t.air_c)[:, None]), 10)
-        slow = refine.by_prediction_errors(
-            replace(slow, x0=np.zeros(slow.order)), block_mean(t.power_w[:, None], 10), y
-        )[0]
-    if not slow.stable or (np.diag(slow.a) <= 0).any():
-        return model
-    return replace(
-        slow.resample(model.period_s),
-        info={**model.info, "prediction_error": slow.info.get("prediction_error")},
-    )
 
 
 def with_air_alone(model: StateSpace) -> StateSpace:
@@ -117,8 +69,7 @@ def identify(tests: list[Recorded], order: int | None) -> StateSpace:
     """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
     A change of the air shifts every rise by C b_air. This effect is simulated with the model of the previous
-    round and subtracted. `order` None: selected by BIC in the last round.
-    """
+    round and subtracted. `order` None: selected by BIC in the last round."""
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         model = modal.identify(
@@ -162,8 +113,7 @@ def compensator(
 
     Sensor readings come every SENSOR_S. Process noise is per second, so it scales with the period. A
     quantised reading ten times a second brings no more information than one a second, so its variance grows
-    in proportion.
-    """
+    in proportion."""
     model = kalman.model
     scale = SENSOR_S / model.period_s
     at_sensor = _at_period(model, SENSOR_S)
@@ -196,7 +146,6 @@ def compensator(
 def _at_period(model: StateSpace, period_s: float) -> StateSpace:
     """Resample the model; keep the air's effect (K per K/s over one period) exact.
 
-    The air's change is a shift of all rises, not a rate that is held into the network.
-    """
+    The air's change is a shift of all rises, not a rate that is held into the network."""
     fast = model.resample(period_s)
     return replace(fast, b=np.column_stack([fast.b[:, 0], model.b[:, 1] * period_s / model.period_s]))

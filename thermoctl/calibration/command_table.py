@@ -26,15 +26,8 @@ TABLE: Table = {
             "propose PID gains from the closed loop's response to setpoint ramps of a few um; asks, then arms the rig with "
             "all protections",
             "thermoctl.calibration.commands:tune",
-            "config method write yes",
+            "config write yes",
             CONFIG,
-            argument(
-                "--method",
-                choices=("imc", "zn"),
-                default="imc",
-                help="imc: lambda tuning with a phase margin of 45 deg and a gain margin of 2 (default); "
-                "zn: Ziegler-Nichols, Table I of the paper",
-            ),
             argument(
                 "--write",
                 action="store_true",

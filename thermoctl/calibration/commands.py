@@ -39,9 +39,8 @@ def run_experiment(
 
     With a running daemon it runs in real time under the daemon's protections. Without one it runs on the
     simulated back end, faster than real time. An experiment of inputs can also run on a plant file. Returns 1
-    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there.
-    """
-    if experiment.lists_inputs(name):
+    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there."""
+    if Path(name).suffix in (".yaml", ".yml"):  # the file of an experiment, not a test of the rig
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
             return experiment.on_plant(inputs, None if dry_run else plant, Path(out or f"{inputs.name}.csv"))
@@ -80,8 +79,7 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str | 
     settings = load_settings(config)
     points = settings.channels.point_names
     r2, r3, r4 = (recorded.read(p, points) for p in (test_2, test_3, test_4a))
-    thermal, kalman, variances, um, refined = chain.calibrate_refined([r2, r3, r4], order or None)
-    print(f"prediction-error refinement: {refined}")
+    thermal, kalman, variances, um = chain.calibrate([r2, r3, r4], order or None)
     model = chain.compensator(kalman, um, settings.loop.period_s, points=points)
     left = r4.error_um - um.predict(
         chain.run_kalman(kalman, r4), chain.smooth_air(r4.air_c), um.info["start_um"]
@@ -90,7 +88,6 @@ def identify(test_2: str, test_3: str, test_4a: str, config: str, models: str | 
         "time_constants_s": thermal.info["time_constants_s"],
         "residual_rms_k": thermal.info["residual_rms"],
         "variances": variances,
-        "refinement": refined,
     }
     figures["expansion_rms_um"] = float(np.sqrt(np.nanmean(left**2)))
     folder = _models(models, settings)
@@ -129,18 +126,17 @@ def model(action: str, models: str | None, name: str | None) -> int:
     return 0
 
 
-def tune(config: str, method: str, write: bool, yes: bool) -> int:
+def tune(config: str, write: bool, yes: bool) -> int:
     """Run `thermoctl tune`: propose gains from the response to short setpoint ramps.
 
     On request the proposal is proven on the rig, step by step, and written. Returns 1 when the user answered
-    no.
-    """
+    no."""
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     one = schedules.triangles(settings, rig.now()["compensated_um"])
     if not drive.agreed(rig, [one] * (TESTS if write else 1), yes):
         return 1
-    tuned = tune_loop(rig, method, write, Keyboard(False), lambda line: print(line, flush=True))
+    tuned = tune_loop(rig, write, Keyboard(False), lambda line: print(line, flush=True))
     if write and tuned.proposed != tuned.present:
         tuning.write(Path(settings.path), tuned.proposed, settings.axis)
         print(f"written to {settings.path}; 'thermoctl reload' applies it")
@@ -169,8 +165,7 @@ def calibrate(
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
     Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
-    calibrated, HardwareError for one that refuses.
-    """
+    calibrated, HardwareError for one that refuses."""
     load("matplotlib", "calibrate")  # the report needs it: if it is missing, end before any test
     settings = load_settings(config)
     rig = drive.rig_of(settings)

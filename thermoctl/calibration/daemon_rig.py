@@ -98,8 +98,7 @@ class DaemonRig:
         because the rig cools meanwhile. The model is fitted to the measured rows, not to the schedule.
         `rest`: wait first until the rig is at rest. `gains`: tried until it disarms. Raises Aborted when
         the law leaves ARMED, the daemon ends, or the user ends the test. Raises HardwareError when the rig
-        does not arm.
-        """
+        does not arm."""
         if earlier is not None:
             yield rows_of(earlier, self.settings.row)
         elif rest:
@@ -167,9 +166,8 @@ class DaemonRig:
         with contextlib.suppress(InputError):
             daemon.ask({"command": "disarm"})
             return
-        until = (
-            time.monotonic() + RESTART_S
-        )  # the command process alone may have ended; the supervisor starts it again
+        # The command process alone may have ended; the supervisor starts it again.
+        until = time.monotonic() + RESTART_S
         while time.monotonic() < until:
             with contextlib.suppress(InputError):
                 ask(self.settings.socket.path, {"command": "disarm"})
@@ -247,8 +245,7 @@ def at_rest(seen: list[tuple[float, np.ndarray]]) -> bool:
     """Check whether a rig of these temperatures, (s, degC (points,)) oldest first, is at rest.
 
     At rest: all temperatures are equal within REST_K, or none moved by more than REST_K in the last REST_S.
-    Thermocouples differ by a degree.
-    """
+    Thermocouples differ by a degree."""
     now, newest = seen[-1]
     if np.nanmax(newest) - np.nanmin(newest) <= REST_K:
         return True

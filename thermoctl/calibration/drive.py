@@ -11,7 +11,8 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from thermoctl.daemon.control_socket import ask
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.identify.tuning import Gains
+from thermoctl.recording.files import read_table
+from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.rig.make import make_devices
@@ -48,12 +51,27 @@ def rig_of(settings: Settings) -> DrivenRig:
     return SimulatedRig(settings)
 
 
+def earlier_part(
+    rig: DrivenRig, path: Path, at_s: float, say: Callable[[str], None]
+) -> tuple[Table | None, float]:
+    """Return the rows of an interrupted test on a daemon, and the time that it reached.
+
+    It starts again on a simulated rig, and where the daemon's own recording has a gap since then."""
+    if not path.exists() or not isinstance(rig, DaemonRig):
+        return None, 0.0
+    earlier = rig.meanwhile(read_table(path))
+    if earlier is None:
+        say("starts again: the daemon did not record without a gap since it was ended")
+        return None, 0.0
+    say(f"goes on at {at_s:.0f} s")
+    return earlier, at_s
+
+
 def agreed(rig: DrivenRig, schedules: Sequence[Schedule], yes: bool) -> bool:
     """Report which rig will move, how far, how long, and the coil's predicted temperature.
 
     Ask before a daemon's rig moves, unless `yes`. Raises InputError for setpoints outside the configuration's
-    limits, for a coil that would become too hot, and when nobody can be asked.
-    """
+    limits, for a coil that would become too hot, and when nobody can be asked."""
     settings = rig.settings
     p = settings.protection
     low, high = within_limits(settings, schedules)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.calibration import drive, schedules
-from thermoctl.calibration.daemon_rig import DaemonRig
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
 from thermoctl.configuration.settings import Settings
@@ -19,15 +18,10 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
-from thermoctl.recording.files import read_table, write_table
+from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 
 ENDED = 3  # exit status of a test that ended early
-
-
-def lists_inputs(name: str) -> bool:
-    """Check whether a name is the file of an experiment, and not a test of the rig."""
-    return Path(name).suffix in (".yaml", ".yml")
 
 
 def of_inputs(path: str) -> experiments.Inputs:
@@ -67,8 +61,7 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    Returns 1 when the user answered no, ENDED when it ended early.
-    """
+    Returns 1 when the user answered no, ENDED when it ended early."""
     schedules.within_limits(settings, [schedule])
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
@@ -86,7 +79,9 @@ def on_rig(
 def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
     """Run a schedule and write the rows. Until its end, a file beside them holds the time reached."""
     progress_path = path.with_name(path.name + ".progress")
-    earlier, at_s = _earlier(rig, path, progress_path) if resume else (None, 0.0)
+    earlier, at_s = None, 0.0
+    if resume and progress_path.exists():
+        earlier, at_s = drive.earlier_part(rig, path, float(progress_path.read_text()), print)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
     done_s = [at_s]
@@ -118,18 +113,3 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
         file=sys.stderr,
     )
     return ENDED
-
-
-def _earlier(rig: drive.DrivenRig, path: Path, progress_path: Path) -> tuple[Table | None, float]:
-    """Read the rows of an interrupted test on a daemon, and the time that it reached."""
-    if not (path.exists() and progress_path.exists() and isinstance(rig, DaemonRig)):
-        return None, 0.0
-    earlier = rig.meanwhile(read_table(path))
-    if earlier is None:
-        print(
-            "starts again: the daemon did not record without a gap since it was ended, and heat does not wait"
-        )
-        return None, 0.0
-    at_s = float(progress_path.read_text())
-    print(f"goes on at {at_s:.0f} s")
-    return earlier, at_s

@@ -57,8 +57,7 @@ def mean_and_two_s(error_um: np.ndarray) -> tuple[float, float]:
 def approaches(setpoint_um: np.ndarray, settle: int) -> list[tuple[int, float, int]]:
     """Find the stops of the motion.
 
-    Return (index `settle` samples after arrival, target, direction +1 or -1) of each.
-    """
+    Return (index `settle` samples after arrival, target, direction +1 or -1) of each."""
     still = np.concatenate([[False], setpoint_um[1:] == setpoint_um[:-1]])
     out, last = [], 0
     for k in range(1, len(still)):

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 class Keyboard:
     """Pause and end a test from the keyboard.
 
-    Ctrl-C pauses, Enter continues, a second Ctrl-C (or SIGTERM) ends it.
-    """
+    Ctrl-C pauses, Enter continues, a second Ctrl-C (or SIGTERM) ends it."""
 
     def __init__(self, interactive: bool):
         self.interactive, self.paused, self.ended = interactive, False, False

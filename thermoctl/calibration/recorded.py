@@ -98,7 +98,6 @@ def as_table(rows: np.ndarray, path: str | Path, layout: Row) -> Table:
 def causes(row: np.ndarray) -> str:
     """Name the faults of a record row that trip, with their remedies.
 
-    Without any fault, a user disarmed the rig.
-    """
+    Without any fault, a user disarmed the rig."""
     tripping = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
     return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in tripping) or "somebody disarmed it"

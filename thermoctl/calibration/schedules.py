@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +71,7 @@ def within_limits(settings: Settings, schedules: Sequence[Schedule]) -> tuple[fl
 def check_predicted(inputs: experiments.Inputs, settings: Settings) -> None:
     """Refuse an experiment whose predicted readings exceed the limits of `protection`.
 
-    Raises InputError that names the reading.
-    """
+    Raises InputError that names the reading."""
     p = settings.protection
     for column, (low, high) in inputs.predicted.items():
         channel = "position_um" if column == "position_raw_um" else column
@@ -125,23 +123,8 @@ def power_lines(settings: Settings, schedule: Schedule) -> list[str]:
     if np.ptp(power) > 0:
         t = np.arange(len(power), dtype=float)
         below = 100 * experiments.share_below(t, power, CUTOFF_HZ)
-        lines.append(f"{below:.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz:")
-        lines += spectrum_lines(t, power, CUTOFF_HZ)
+        lines.append(f"{below:.0f} % of the alternating power below f_c = {CUTOFF_HZ:g} Hz")
     return lines
-
-
-def spectrum_lines(t: np.ndarray, power: np.ndarray, cutoff_hz: float) -> list[str]:
-    """Show the alternating power's share in octaves about `cutoff_hz`, as lines for a terminal."""
-    edges = [0.0, *(cutoff_hz * 2.0**k for k in range(-3, 4)), 0.5 / (t[1] - t[0])]
-    f, s = experiments.spectrum(t, power)
-    out = []
-    for low, high in pairwise(edges):
-        share = 100 * s[(f > low) & (f <= high)].sum() / s.sum()
-        mark = "  <- f_c" if high == cutoff_hz else ""
-        out.append(
-            f"  {1e3 * low:8.3f} to {1e3 * high:8.3f} mHz {share:5.1f} % {'#' * round(share / 2)}{mark}"
-        )
-    return out
 
 
 def span(s: float) -> str:

@@ -5,7 +5,8 @@ The configuration's simulated back end under the daemon's law, faster than real 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Generator
+import time
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,15 @@ import numpy as np
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import causes
 from thermoctl.configuration.settings import Settings
-from thermoctl.control import arming
+from thermoctl.control import arming, faults
 from thermoctl.control.model import CompensatorModel
 from thermoctl.daemon.answers.snapshot import channel_states
 from thermoctl.daemon.offline.simulate import Simulation
 from thermoctl.daemon.tick.assemble import law_parameters
-from thermoctl.identify import experiments
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
 from thermoctl.identify.tuning import Gains
 from thermoctl.recording.table import Table
-from thermoctl.rig.signals import AT
+from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.base.backend import HardwareError
 
 EVERY_S = 0.1  # time between the rows that are kept
@@ -37,12 +37,6 @@ def with_model(settings: Settings, model: CompensatorModel | None) -> Settings:
     if model is None:
         protection = dataclasses.replace(protection, innovation_limit_c=ANY_INNOVATION_C)
     return dataclasses.replace(settings, compensation=compensation, protection=protection)
-
-
-def with_gains(settings: Settings, gains: Gains) -> Settings:
-    """Set other gains of the position loop."""
-    control = dataclasses.replace(settings.control, kp=gains.kp, ti_s=gains.ti_s, td_s=gains.td_s)
-    return dataclasses.replace(settings, control=control)
 
 
 class SimulatedRig:
@@ -103,8 +97,7 @@ class SimulatedRig:
 
         `gains` are applied after arming, without a jump. `earlier`, `at_s` and `rest` are not used: the rows
         are reproducible, and the rig starts at rest.
-        Raises Aborted when the law leaves ARMED or the user ends it.
-        """
+        Raises Aborted when the law leaves ARMED or the user ends it."""
         settings = with_model(self.settings, model)
         simulation = self.simulation(settings, model)
 
@@ -117,12 +110,52 @@ class SimulatedRig:
         try:
             if gains is not None:
                 simulation.arm()
-                simulation.reload(law_parameters(with_gains(settings, gains)))
+                tried = dataclasses.replace(settings.control, kp=gains.kp, ti_s=gains.ti_s, td_s=gains.td_s)
+                simulation.reload(law_parameters(dataclasses.replace(settings, control=tried)))
                 simulation.tick()
-            yield from experiments.run(
-                simulation, schedule, max(1, round(every_s / simulation.period_s)), 0.0, progress, stop
-            )
+            every = max(1, round(every_s / simulation.period_s))
+            yield from play(simulation, schedule, every, progress, stop)
         except RuntimeError:
             raise Aborted(f"not READY within {READY_S:g} s: {causes(simulation.row)}", 0.0) from None
         finally:
             simulation.close()
+
+
+def play(
+    simulation: Simulation,
+    schedule: Schedule,
+    every: int = 100,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[np.ndarray]:
+    """Run a schedule on a rig, which is armed first; yield blocks of record rows, every `every`-th tick.
+
+    Each block is given out before the next is computed, so an abort loses nothing. Raises Aborted when the
+    law leaves ARMED (the fault bits are named) or `stop()` turns true."""
+    period, waiting = simulation.period_s, schedule.commands()
+    ticks = round(schedule.duration_s / period)
+    block, began, k = [], time.monotonic(), 0
+    state = AT["state"]
+    if simulation.row[state] != arming.ARMED:
+        simulation.arm()
+    while k < ticks:
+        while waiting and round(waiting[0][0] / period) <= k:
+            simulation.command(*waiting.pop(0)[1:])
+        coming = round(waiting[0][0] / period) if waiting else ticks
+        count = min(every - k % every, coming - k, ticks - k)
+        row = simulation.tick(count)
+        k += count
+        if k % every == 0:
+            block.append(row.copy())
+        left, full = row[state] != arming.ARMED, len(block) == 1000 or k == ticks
+        if block and (full or left):
+            yield np.array(block)
+            block = []
+        if full:
+            if progress is not None:
+                progress(Progress(k * period, schedule.duration_s, time.monotonic() - began))
+            if stop():
+                raise Aborted("stopped on request", k * period)
+        if left:
+            standing = [f.name for f in faults.decode(fault_word(row))]
+            raise Aborted(f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", k * period)

@@ -16,7 +16,7 @@ import numpy as np
 from thermoctl.calibration import chain, drive
 from thermoctl.calibration.iso230 import mean_and_two_s
 from thermoctl.calibration.keyboard import Keyboard
-from thermoctl.calibration.recorded import Recorded, read
+from thermoctl.calibration.recorded import SETTLED, Recorded, read
 from thermoctl.calibration.schedules import triangles
 from thermoctl.calibration.tune import Disagrees, tune
 from thermoctl.configuration.settings import Settings
@@ -31,7 +31,6 @@ from thermoctl.rig.signals import AT
 FITTED = ("test_2", "test_3", "test_4a")  # the tests that the model is fitted to
 SHOWN_S = 3.0  # part of the ramps' recording in the report
 SHOWN = 2000  # approximate number of points of a curve in the report
-SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
 AT_TARGET_UM = 1e-6  # largest distance of reference and setpoint at rest
 NEEDED = ("position_um", "output_reference_um", "voltage_v", "current_a", "air_c")
 """Channels that a calibration needs besides the points'."""
@@ -165,7 +164,7 @@ def pid(rig: drive.DrivenRig) -> Pid:
     before = after = NOTHING
     said: list[str] = []
     try:
-        tuned = tune(rig, "imc", True, Keyboard(False), said.append)
+        tuned = tune(rig, True, Keyboard(False), said.append)
         proposed, before, after = tuned.proposed, tuned.before, tuned.after or NOTHING
         summary = f"present: {before}; " + (
             "nothing to change" if proposed == tuned.present else f"proposed, each step measured: {after}"

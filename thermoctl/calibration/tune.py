@@ -44,15 +44,12 @@ class Found:
     after: Measured | None
 
 
-def tune(
-    rig: drive.DrivenRig, method: str, verify: bool, keyboard: Keyboard, say: Callable[[str], None]
-) -> Found:
+def tune(rig: drive.DrivenRig, verify: bool, keyboard: Keyboard, say: Callable[[str], None]) -> Found:
     """Propose gains from a test of the rig's loop; `verify`: prove each step towards them on the rig.
 
-    method: 'imc' or 'zn'. With `verify` the result's gains are proven, or the present ones. Raises InputError
-    where the test gives no gains. Raises Disagrees where a step's loop is not as predicted, and HardwareError
-    where the rig ended a test. Then the present gains are in force.
-    """
+    With `verify` the result's gains are proven, or the present ones. Raises InputError where the test gives
+    no gains. Raises Disagrees where a step's loop is not as predicted, and HardwareError where the rig ended
+    a test. Then the present gains are in force."""
     settings = rig.settings
     period_s, average = settings.loop.period_s, int(settings.control.moving_average)
     present = _present(rig)
@@ -69,35 +66,23 @@ def tune(
         f"{plant.residual:.2g} um; {timing.skipped + timing.late} of {timing.due} ticks skipped or late"
     )
     say(f"present: {before} measured")
-    derivative = present.td_s > 0.0
-    if method == "zn":
-        wanted = tuning.ziegler_nichols(plant, derivative)
-        steps = tuning.way(present, wanted)
-        share = tuning.share_of_margins(models, wanted, period_s, average)
-        refused = (
-            f"the gains of --method zn have {_predicted(models, wanted, period_s, average)}"
-            if share < 1.0
-            else ""
-        )
-    else:
-        wanted, refused = tuning.robust(models, period_s, average, derivative), ""
-        steps = tuning.propose(models, present, wanted, period_s, average)
+    wanted = tuning.robust(models, period_s, average, derivative=present.td_s > 0.0)
+    steps = tuning.propose(models, present, wanted, period_s, average)
     proposed = steps[-1]
-    what = f"not proposed ({proposed.how})" if refused else f"proposed ({proposed.how})"
-    say(f"{what}: {_predicted(models, proposed, period_s, average)}")
-    if not refused and _is_good(before) and _speed(proposed) < FASTER * _speed(present):
+    say(f"proposed ({proposed.how}): {_predicted(models, proposed, period_s, average)}")
+    is_good = before.phase_deg >= tuning.WANTED_DEG and before.gain >= tuning.WANTED_GAIN
+    if is_good and _speed(proposed) < FASTER * _speed(present):
         say("the present gains have the wanted margins and these are not faster: nothing to change")
         return Found(plant, present, present, before, before)
     say(tuning.difference(present, proposed))
-    if not refused and _speed(wanted) > FASTER * _speed(proposed):
+    if _speed(wanted) > FASTER * _speed(proposed):
         say(
             f"no gain changes by more than a factor of {TRIAL_FACTOR:g} at once: run it again after this proposal"
         )
     if not verify:
         return Found(plant, present, proposed, before, None)
-    if refused:
-        raise InputError(f"{refused}: not tried on the rig; take --method imc")
-    after = _prove(rig, keyboard, models, steps, float(np.abs(_error(rows)).max()), say)
+    error_um = np.abs(rows[:, AT["reference_um"]] - rows[:, AT["compensated_um"]]).max()
+    after = _prove(rig, keyboard, models, steps, float(error_um), say)
     return Found(plant, present, proposed, before, after)
 
 
@@ -156,17 +141,9 @@ def _test(
     return rows, timing
 
 
-def _error(rows: np.ndarray) -> np.ndarray:
-    return rows[:, AT["reference_um"]] - rows[:, AT["compensated_um"]]
-
-
 def _speed(g: Gains) -> float:
     """Return the integral gain: a constant disturbance leaves an integrated error of its inverse."""
     return g.kp / g.ti_s
-
-
-def _is_good(m: Measured) -> bool:
-    return m.phase_deg >= tuning.WANTED_DEG and m.gain >= tuning.WANTED_GAIN
 
 
 def _predicted(models: tuple[SecondOrder, SecondOrder], gains: Gains, period_s: float, average: int) -> str:

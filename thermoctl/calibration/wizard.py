@@ -26,9 +26,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from thermoctl.calibration import steps
-from thermoctl.calibration.daemon_rig import DaemonRig
-from thermoctl.calibration.drive import DrivenRig
+from thermoctl.calibration import drive, steps
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
 from thermoctl.calibration.report import report
@@ -39,8 +37,7 @@ from thermoctl.files.safe_file import make_folder, move, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile, tuning
 from thermoctl.identify.experiments import Aborted, Progress, Schedule
-from thermoctl.recording.files import read_table, write_table
-from thermoctl.recording.table import Table
+from thermoctl.recording.files import write_table
 from thermoctl.rig.signals import AT
 
 TESTS = ("test_1", "test_2", "test_3", "test_4a", "test_4b")
@@ -70,7 +67,7 @@ class Wizard:
     def __init__(
         self,
         settings: Settings,
-        rig: DrivenRig,
+        rig: drive.DrivenRig,
         folder: Path,
         tests: Mapping[str, Schedule],
         order: int,
@@ -83,10 +80,8 @@ class Wizard:
         self.fingerprint = self._fingerprint()
         self.done: dict[str, steps.Result] = {}
         self.at_s: dict[str, float] = {}  # time reached by an interrupted test
-        self._used_s, self._tested_s = (
-            0.0,
-            0.0,
-        )  # wall and rig seconds of tests in this run, for the time left
+        # Wall and rig seconds of tests in this run, for the time left.
+        self._used_s, self._tested_s = (0.0, 0.0)
         for name in TESTS:
             if name not in tests:
                 raise InputError(f"{self.experiments}: no experiment '{name}'; a calibration needs it")
@@ -164,7 +159,11 @@ class Wizard:
     def _test(self, number: int, name: str, keyboard: Keyboard) -> bool:
         """Run a test to its end; return False if it was interrupted: a new call continues from there."""
         schedule, part = self.tests[name], self.folder / f"{name}.part.parquet"
-        earlier, at_s = self._earlier(name, part)
+        earlier, at_s = None, 0.0
+        if name in self.at_s:
+            earlier, at_s = drive.earlier_part(
+                self.rig, part, self.at_s[name], lambda line: self.say(f"   {name} {line}")
+            )
         self.say(f"{number:2d}/{len(STEPS)} {name}: {schedule.title}, {span(schedule.duration_s)}")
         left_s = sum(
             self.tests[n].duration_s for n in STEPS[number:] if n in self.tests and n not in self.done
@@ -201,17 +200,6 @@ class Wizard:
             float(np.nanmax(power)),
         )
         return True
-
-    def _earlier(self, name: str, part: Path) -> tuple[Table | None, float]:
-        """Read the daemon's rows of an interrupted test, and the time that it reached."""
-        if name not in self.at_s or not part.exists() or not isinstance(self.rig, DaemonRig):
-            return None, 0.0
-        earlier = self.rig.meanwhile(read_table(part))
-        if earlier is None:
-            self.say(f"   {name} starts again: the daemon did not record without a gap since it was ended")
-            return None, 0.0
-        self.say(f"   {name} goes on at {self.at_s[name]:.0f} s")
-        return earlier, self.at_s[name]
 
     def _time_left(self, p: Progress, left_s: float) -> tuple[float, float]:
         """Estimate the seconds left of this test and of all, at the pace of the tests so far."""

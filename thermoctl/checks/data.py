@@ -31,14 +31,18 @@ SLOWS = 0.25  # a body comes to rest if its last steps are below this share of i
 def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     """Check the columns that the plant reads."""
     if len(table.t) < FEW:
-        return [_few(table)]
+        rows = f"{len(table.t)} row{'s' * (len(table.t) != 1)}"
+        what, advice = f"{rows}, of which nothing is checked", f"Give {FEW} or more."
+        return [Finding("few", table.path, what, advice, severe=False)]
     findings = _gaps(model, table, excitation)
     read = [i for i in model.plant.readings() if i.column in table.columns]
     for item in read:
         there = np.isfinite(table.columns[item.column])
         values = table.columns[item.column][there]
         if not there.any():
-            findings.append(_empty(table, item.name, item.column))
+            what = f"column '{item.column}' has no value at all"
+            advice = f"Check how '{item.name}' was logged."
+            findings.append(Finding("empty", table.path, what, advice, severe=False))
         elif len(values) >= FEW and item.name in model.plant.outputs:
             # A periodic input repeats by itself; measured noise does not.
             findings += _copies(table, item.column, values, table.t[there])
@@ -49,26 +53,6 @@ def data_findings(model: Model, table: Table, excitation: Excitation) -> list[Fi
         return findings
     return (
         findings + _between(model, table, excitation, simulated) + _dead(model, table, excitation, simulated)
-    )
-
-
-def _few(table: Table) -> Finding:
-    return Finding(
-        "few",
-        table.path,
-        f"{len(table.t)} row{'s' * (len(table.t) != 1)}, of which nothing is checked",
-        f"Give {FEW} or more.",
-        severe=False,
-    )
-
-
-def _empty(table: Table, name: str, column: str) -> Finding:
-    return Finding(
-        "empty",
-        table.path,
-        f"column '{column}' has no value at all",
-        f"Check how '{name}' was logged.",
-        severe=False,
     )
 
 
@@ -223,7 +207,11 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             continue
         findings += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
     scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
-    driving = [i for i in driving_inputs(model.plant) if not _surroundings(i)]
+    driving = [
+        i
+        for i in driving_inputs(model.plant)
+        if i.role != "ambient" and not (i.role is None and i.unit in ("degC", "K", "degF"))
+    ]
     dead = driving and not any(moves(table, i.column) for i in driving)
     if dead and not _follows(excitation.y, run, scales) and not _by_itself(model, excitation, scales):
         names = ", ".join(f"'{i.column}'" for i in driving)
@@ -272,10 +260,6 @@ def driving_inputs(plant: Plant) -> list[Input]:
 def moves(table: Table, column: str) -> bool:
     """Return whether a column has two different values."""
     return bool(np.nanmax(table.columns[column]) > np.nanmin(table.columns[column]))
-
-
-def _surroundings(i: Input) -> bool:
-    return i.role == "ambient" or (i.role is None and i.unit in ("degC", "K", "degF"))
 
 
 def _stuck(

@@ -32,7 +32,7 @@ def plant_findings(model: Model, excitations: Sequence[Excitation]) -> list[Find
         if findings and findings[-1].kind == "unstable":
             return findings
         findings += _time_constants(model, excitation)
-    return _once(findings)
+    return list({(f.kind, f.what): f for f in reversed(findings)}.values())[::-1]  # each once, the first one
 
 
 def unit_findings(plant: Plant) -> list[Finding]:
@@ -43,11 +43,6 @@ def unit_findings(plant: Plant) -> list[Finding]:
     what = "no quantity has a unit, so no expression could be checked"
     todo = "Give inputs, parameters, nodes and outputs their units."
     return [Finding("no units", plant.file, what, todo, severe=False)]
-
-
-def _once(found: list[Finding]) -> list[Finding]:
-    """Return the findings without repetitions: of those with the same kind and text, the first one."""
-    return list({(f.kind, f.what): f for f in reversed(found)}.values())[::-1]
 
 
 def start_values(model: Model, excitation: Excitation) -> dict[str, float]:

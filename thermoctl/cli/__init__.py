@@ -18,9 +18,8 @@ from thermoctl.extras import lacking
 from thermoctl.files.yamlfile import InputError
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(
-        _name, "1"
-    )  # set before numpy is loaded: BLAS threads on busy cores wait for each other
+    # Set before numpy is loaded: BLAS threads on busy cores wait for each other.
+    os.environ.setdefault(_name, "1")
 
 DESCRIPTION = """\
 Holds the output of a precision linear actuator in place while its coil heats up. Finds the physics that a simulation

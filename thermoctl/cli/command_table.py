@@ -54,7 +54,7 @@ TABLE: Table = {
         ),
         command(
             "service",
-            "install or remove the systemd unit, its user, its device rules, the manual page and the shell completions",
+            "install or remove the systemd unit, its user, its device rules and the shell completions",
             "thermoctl.cli.joined:service",
             "",
             argument("action", choices=["install", "uninstall"]),
@@ -221,17 +221,9 @@ TABLE: Table = {
         command(
             "completion",
             "print the shell's completion script; source it",
-            "thermoctl.cli.manual:completion",
+            "thermoctl.cli.completion:completion",
             "parser shell",
             argument("shell", choices=["bash", "zsh", "tcsh"]),
-        ),
-        command(
-            "manual",
-            "show the manual page, or install it with the shell completions",
-            "thermoctl.cli.manual:command",
-            "parser action root",
-            argument("action", nargs="?", choices=["show", "install", "uninstall"], default="show"),
-            ROOT,
         ),
     ),
 }

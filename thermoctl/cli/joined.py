@@ -40,16 +40,22 @@ def virtual_rig(settings: Any, line: str) -> int:
 
 
 def service(args: argparse.Namespace) -> int:
-    """Install or remove the unit. Removing the last unit removes manual page and completions, too."""
-    from thermoctl.cli import manual
+    """Install or remove the unit. Removing the last unit removes the shell completions, too."""
+    from thermoctl.cli import completion
     from thermoctl.daemon.service import install, uninstall, units
 
     root, config = Path(args.root), Path(args.config) if args.config else None
     if args.action == "install":
-        return install(config or Path(), root) or manual.command(args.parser, "install", args.root)
-    if (done := uninstall(config, root)) or units(root):
-        return done
-    return manual.command(args.parser, "uninstall", args.root)
+        if status := install(config or Path(), root):
+            return status
+        verb, paths = "wrote", completion.install(args.parser, root)
+    else:
+        if (status := uninstall(config, root)) or units(root):
+            return status
+        verb, paths = "removed", completion.uninstall(root)
+    for path in paths:
+        print(f"{verb} {path}")
+    return 0
 
 
 def effects(args: argparse.Namespace) -> int:

@@ -246,9 +246,9 @@ class HalSettings:
     """The hardware, or its simulation."""
 
     backend: str = option(
-        "where readings come from: a simulated plant, devices, or a recording that is played back",
+        "where readings come from: a simulated plant, or devices",
         restart=True,
-        choices=("simulated", "devices", "replay"),
+        choices=("simulated", "devices"),
     )
     plant: str = option(
         "plant file of back end `simulated`, relative to this file; the compensator's model assumes this plant",
@@ -274,7 +274,6 @@ class HalSettings:
     sensor_period_s: float = option(
         "sampling period of the simulated temperature sensors", 0.1, "s", 1e-3, 60.0, restart=True
     )
-    recording: str = option("recording that back end `replay` plays, relative to this file", "", restart=True)
     run_dir: str = option(
         "folder of the virtual rig's control socket and reference recording, relative to this file",
         "../run/wire",
@@ -311,8 +310,7 @@ class Settings:
     A rig file with `axes` gives two kinds of settings. The settings of one axis have the same fields as
     those of a rig without axes; `axis` is its name, `rig_socket` the rig's socket. The settings of the whole
     rig have `axes` and the channels of all axes. Their sections `control`, `compensation` and `protection`
-    are those of the first axis.
-    """
+    are those of the first axis."""
 
     path: str
     rig: RigSettings
@@ -420,8 +418,7 @@ def _plain(value: Any) -> Any:
 def load_settings(path: str | Path, axis: str = "") -> Settings:
     """Read and check a configuration, of one axis where the rig has several: `axis`, or PATH#AXIS.
 
-    Raises InputError with file:line:column for the first error, or where an axis must be chosen.
-    """
+    Raises InputError with file:line:column for the first error, or where an axis must be chosen."""
     file, _, named = str(path).rpartition("#") if not Path(path).exists() else (str(path), "", "")
     rig = load_rig(file or path)
     if axis := axis or (named if file else ""):
@@ -655,7 +652,8 @@ def _value(section: _Options, key: str, kind: Any, row: Option) -> Any:
         return _number(node, label, row, whole=kind is int)
     if origin is dict:
         mapping = _Options(node, label, section.channels)
-        return _texts(mapping) if inner[1] is str else _limits(mapping, row)
+        is_text = inner[1] is str
+        return {n: mapping.text(n) for n in mapping.node.value} if is_text else _limits(mapping, row)
     if origin is tuple and inner[0] is Node:
         return tuple(section.list(key))
     if origin is tuple:
@@ -695,10 +693,6 @@ def _with_unit(label: str, text: str, unit: str, node: Node) -> float:
         raise node.error(
             f"{label}: '{text}': the unit does not fit ({e}); expected {unit or 'no unit'}"
         ) from None
-
-
-def _texts(mapping: Section) -> dict[str, str]:
-    return {name: mapping.text(name) for name in mapping.node.value}
 
 
 def _limits(mapping: _Options, row: Option) -> dict[str, float]:
@@ -749,7 +743,7 @@ def _check_together(settings: Settings, root: Node) -> None:
         raise place("protection", "required").error(
             "control.mode: position needs position_um in protection.required: the first target is the measured position"
         )
-    needed = {"simulated": "plant", "devices": "devices", "replay": "recording"}[hal.backend]
+    needed = {"simulated": "plant", "devices": "devices"}[hal.backend]
     if not getattr(hal, needed):
         raise place("hal", "backend").error(f"hal.{needed} is missing: back end '{hal.backend}' needs it")
     backend = {"device": "devices", "tick": "simulated"}.get(settings.loop.pace, hal.backend)

@@ -25,8 +25,7 @@ def next_state(state: int, command: int, started: bool, tripped: bool, critical:
     """Return the state after this tick.
 
     started: the law has run its self-test. tripped: an active fault forbids driving. critical: an active
-    fault latches from every state (implies tripped).
-    """
+    fault latches from every state (implies tripped)."""
     if not started or state == OFF:
         return SAFE if started else OFF
     if critical:

@@ -123,8 +123,7 @@ def in_order(standing: Iterable[Standing], trips: int) -> list[tuple[Standing, s
     """Return (fault, name of its cause or ''), each cause followed by its consequences.
 
     Causes are ordered by time, those that tripped first. trips: the bits of the faults that disabled the
-    amplifier, or keep it disabled.
-    """
+    amplifier, or keep it disabled."""
     left = sorted(standing, key=lambda f: (f.t_s, -_reach(f.name), BIT[f.name]))
     heads = [
         f

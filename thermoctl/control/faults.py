@@ -25,8 +25,7 @@ from thermoctl.rig.channels import FIXED, GROUPS
 class Fault:
     """One row. A fault of a reading names its `group` of channels and its `kind`.
 
-    cause: the usual causes, most frequent first; check: how to find out which it is; cure: the repair.
-    """
+    cause: the usual causes, most frequent first; check: how to find out which it is; cure: the repair."""
 
     bit: int
     name: str

@@ -1,4 +1,4 @@
-# C types for law.py. `python -m thermoctl.control.typed` writes the parts between "generated" and "end".
+# C types for law.py. `python -m tests.typed` writes the parts between "generated" and "end".
 cimport cython
 from libc.stdint cimport uint8_t
 

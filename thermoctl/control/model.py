@@ -48,8 +48,7 @@ class CompensatorModel:
     air temperature. points: names of the points, m; () in a model that an older version made.
 
     Raises ValueError when shapes or numbers do not fit together. Files of models, recordings and the warm
-    start's fingerprint derive from these fields.
-    """
+    start's fingerprint derive from these fields."""
 
     kind: str
     period_s: float = _number("s", positive=True)
@@ -156,8 +155,7 @@ def _by_channel(value: float) -> Any:
 class Gains:
     """Gains of the controller, and limits of each channel's readings (arrays over the channels).
 
-    By default a reading has no limit and no channel is required.
-    """
+    By default a reading has no limit and no channel is required."""
 
     kp: float
     ti_s: float

@@ -49,8 +49,7 @@ class Commands:
     A command process that replaces one that was killed gives them up, too.
 
     `reload_settings(settings in force, settings at the start)` reads the file again and returns (settings,
-    parameters, applied keys, keys that need a restart).
-    """
+    parameters, applied keys, keys that need a restart)."""
 
     def __init__(
         self,
@@ -65,9 +64,8 @@ class Commands:
         self.reload_settings, self.log = reload_settings, log
         self.expected_hz = arrival.expected_hz(settings)
         self.can_drive = can_drive(settings)
-        if shared.counters[
-            TRIAL
-        ]:  # gains of a command process that was killed; the file still has the gains before it
+        # Gains of a command process that was killed; the file still has the gains before it.
+        if shared.counters[TRIAL]:
             with contextlib.suppress(InputError):
                 self.settings = reload_settings(settings, settings)[0]
             with contextlib.suppress(InputError):  # the loop is not there: the next arming tries again
@@ -290,8 +288,7 @@ class _Client:
 def listen(path: Path, group: str | None) -> socket.socket:
     """Return a listening socket at `path`, for owner and group.
 
-    Raises InputError where it cannot be made.
-    """
+    Raises InputError where it cannot be made."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_socket():
@@ -359,8 +356,7 @@ def _accept(listener: socket.socket, selector: selectors.BaseSelector) -> None:
 def _serve_client(client: _Client, events: int, selector: selectors.BaseSelector, commands: Commands) -> None:
     """Do at most one read, one request and one write, so that no client delays another.
 
-    Nothing is read from a client that has not taken its answer.
-    """
+    Nothing is read from a client that has not taken its answer."""
     try:
         if events & selectors.EVENT_READ:
             data = client.connection.recv(MAX_LINE)

@@ -9,7 +9,7 @@ import json
 import sys
 
 from thermoctl.configuration.settings import Settings
-from thermoctl.daemon.answers.display import counter_lines, fault_lines, value_lines
+from thermoctl.daemon.answers.display import between, counter_lines, fault_lines, value_lines
 from thermoctl.daemon.control_socket import ask
 from thermoctl.daemon.lock import holder
 from thermoctl.files.yamlfile import InputError
@@ -106,15 +106,13 @@ def latency(settings: Settings, as_json: bool = False) -> int:
     return 0
 
 
-def _bars(bins: list[list[int]], width: int = 50) -> str:
+def _bars(bins: list[list[int]]) -> str:
     """Draw a histogram of whole microseconds in bins of about doubling width."""
     edges = [0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 1 << 30]
-    counts = [
-        sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)
-    ]
+    counts = between(bins, edges)
     top = max(counts, default=0) or 1
     return "\n".join(
-        f"{low:6d} .. {high if high < 1 << 30 else '':<5} {count:9d} {'#' * round(width * count / top)}"
+        f"{low:6d} .. {high if high < 1 << 30 else '':<5} {count:9.0f} {'#' * round(50 * count / top)}"
         for low, high, count in zip(edges, edges[1:], counts, strict=False)
         if count
     )

@@ -28,8 +28,7 @@ class Connection:
     """A connection to the daemon at `path`: one request after the other.
 
     Raises InputError when the daemon does not answer. After {"command": "arm", "held": true} the daemon
-    disarms the rig when the connection ends, for whatever reason.
-    """
+    disarms the rig when the connection ends, for whatever reason."""
 
     def __init__(self, path: Path | str, timeout_s: float = 3.0):
         self.path, self.timeout_s = path, timeout_s
@@ -93,7 +92,6 @@ class Connection:
 def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:
     """Send one request to the daemon at `path`; return its answer.
 
-    Raises InputError when the daemon does not answer.
-    """
+    Raises InputError when the daemon does not answer."""
     with Connection(path, timeout_s) as connection:
         return connection.ask(request)

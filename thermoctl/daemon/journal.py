@@ -20,8 +20,7 @@ Log = Callable[..., None]
 class Watcher:
     """Logs changes of state, faults and the devices' messages: the loop itself logs nothing.
 
-    Faults are logged with their cause first. While the law warms up (OFF) nothing is a fault.
-    """
+    Faults are logged with their cause first. While the law warms up (OFF) nothing is a fault."""
 
     def __init__(self, shared: Shared, log: Log):
         self.shared, self.log = shared, log
@@ -81,8 +80,7 @@ class Watcher:
     def _devices(self, row: np.ndarray) -> None:
         """Log new messages of the devices, and the drive's error code.
 
-        A channel is logged again only after TELL_AGAIN_S.
-        """
+        A channel is logged again only after TELL_AGAIN_S."""
         if row[AT["state"]] == arming.OFF:
             return
         for c, role in enumerate(self.shared.channels.names):

@@ -52,8 +52,7 @@ def _fingerprint(model: CompensatorModel) -> int:
 def save(path: Path, model: CompensatorModel, state: np.ndarray) -> Path:
     """Save a law's snapshot; return the file.
 
-    Raises WriteError when the disk refuses: the next start is cold.
-    """
+    Raises WriteError when the disk refuses: the next start is cold."""
     text = json.dumps(
         {
             "version": 1,

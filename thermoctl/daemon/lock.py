@@ -33,8 +33,7 @@ def socket_too_long(settings: Settings) -> str:
 def hold(settings: Settings) -> int:
     """Take the rig's lock; return the open file that keeps it.
 
-    Raises InputError when another process holds the rig.
-    """
+    Raises InputError when another process holds the rig."""
     path = lock_path(settings)
     if long := socket_too_long(settings):
         raise InputError(long)
@@ -74,8 +73,7 @@ def is_retaken(settings: Settings, file: int) -> bool:
 def holder(settings: Settings) -> int | None:
     """Return the process id that holds the rig, or None.
 
-    Raises InputError when this user may not read the lock.
-    """
+    Raises InputError when this user may not read the lock."""
     path = lock_path(settings)
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -38,8 +38,7 @@ class Misfit:
 
     Pass rows in order: `add(t_s, innovation_c, kalman_gain)` returns an alarm when one is new. The
     division into calls has no influence. A model without a coil temperature has no innovations and never
-    raises an alarm.
-    """
+    raises an alarm."""
 
     def __init__(self, model: CompensatorModel):
         self._gain, self._noise = float(model.C[0] @ model.gain[:, 0]), math.sqrt(model.R_v)
@@ -58,8 +57,7 @@ class Misfit:
     def add(self, t_s: np.ndarray, innovation_c: np.ndarray, kalman_gain: np.ndarray) -> Alarm | None:
         """Add rows (n,) of each signal; return the newest alarm that they raise.
 
-        NaN innovations (no sample yet) are left out.
-        """
+        NaN innovations (no sample yet) are left out."""
         rows = np.array([t_s, innovation_c, kalman_gain])[:, np.isfinite(t_s) & np.isfinite(innovation_c)]
         alarm = None
         if not self._watches or not rows.shape[1]:
@@ -75,9 +73,8 @@ class Misfit:
         alarm = None
         if not rows.shape[1]:
             return alarm
-        changed = (
-            np.diff(rows[1], prepend=self._last_c) != 0.0
-        )  # the signal holds between samples of the sensor
+        # The signal holds between samples of the sensor.
+        changed = np.diff(rows[1], prepend=self._last_c) != 0.0
         self._last_t, self._last_c = rows[0, -1], rows[1, -1]
         if not changed.any():
             return alarm

@@ -43,8 +43,7 @@ _fork = multiprocessing.get_context("fork")
 class Stop:
     """Set by SIGTERM; each call also counts a heartbeat of the helper.
 
-    SIGINT is left to the supervisor: the terminal sends it to the children, too.
-    """
+    SIGINT is left to the supervisor: the terminal sends it to the children, too."""
 
     def __init__(self, shared: Shared | None = None, beat: int = 0) -> None:
         self.asked, self.shared, self.beat = False, shared, beat
@@ -193,8 +192,7 @@ def _poller_process(settings: Settings, board: Any, device: str) -> int:
 class Child:
     """One process: how it is started, and when it may be started again.
 
-    beats: returns the rounds it has done; None: it is not watched.
-    """
+    beats: returns the rounds it has done; None: it is not watched."""
 
     def __init__(
         self, name: str, main: Callable[..., int], *arguments: Any, beats: Callable[[], float] | None = None
@@ -277,8 +275,7 @@ def restart(children: list[Child], now: float, log: Log) -> None:
 def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | None, Child, list[Child]]:
     """Make the board of slow readings (None without slow devices), the loop and the helpers.
 
-    shared: the segment of each axis; an axis has a recorder, a command socket and a tuner of its own.
-    """
+    shared: the segment of each axis; an axis has a recorder, a command socket and a tuner of its own."""
     slow = slow_devices(settings) if settings.hal.backend == "devices" else []
     board = Board.create(shared_name(settings) + "-board", len(settings.channels.names)) if slow else None
 

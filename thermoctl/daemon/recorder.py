@@ -52,8 +52,7 @@ def law_metadata(
 ) -> str:
     """Return the data that a replay needs besides the rows, as JSON.
 
-    These are the model, the parameters, and the law's state after `tick` (None: a new law).
-    """
+    These are the model, the parameters, and the law's state after `tick` (None: a new law)."""
     return json.dumps(
         {
             "version": LAW_VERSION,
@@ -76,8 +75,7 @@ def law_metadata(
 def read_law_metadata(text: str) -> dict[str, Any]:
     """Read the text of `law_metadata`.
 
-    Keys: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel).
-    """
+    Keys: period_s, generation, tick, state (or None), parameters (Parameters), model (CompensatorModel)."""
     content = json.loads(text)
     if content["version"] != LAW_VERSION:
         raise ValueError(f"law version {content['version']}, this program has version {LAW_VERSION}")
@@ -100,8 +98,7 @@ def read_law_metadata(text: str) -> dict[str, Any]:
 class Recorder:
     """Writes rows in order; starts a new file when the generation changes or the writer is full.
 
-    open_writer(law_metadata) returns a writer with write(rows) and close().
-    """
+    open_writer(law_metadata) returns a writer with write(rows) and close()."""
 
     def __init__(
         self,
@@ -168,8 +165,7 @@ class Recorder:
     def _new_file_after(self, rows: np.ndarray) -> int | None:
         """Return the row of `rows` where a new file may begin, or None.
 
-        It follows the newest saved state, so that the file's replay starts there.
-        """
+        It follows the newest saved state, so that the file's replay starts there."""
         kept = self.shared.state.get()
         if kept is None:
             return None
@@ -200,8 +196,7 @@ class Recorder:
 def make_recorder(settings: Settings, shared: Shared, log: Callable[..., None]) -> Recorder:
     """Make the recorder of a daemon.
 
-    Its files hold every option of the configuration in force, and the law's metadata.
-    """
+    Its files hold every option of the configuration in force, and the law's metadata."""
     from thermoctl.configuration.settings import POINTS, effective
     from thermoctl.daemon.tick.assemble import compensator, in_force, law_parameters, rig_identity
     from thermoctl.recording.writer import RecordingWriter

@@ -21,8 +21,7 @@ def reload_settings(current: Settings, started: Settings) -> tuple[Any, Paramete
     """Read the file again; return (settings, parameters, applied keys, keys that need a restart).
 
     current: the settings in force; started: those at the daemon's start. Raises InputError for an invalid
-    file; then nothing is applied.
-    """
+    file; then nothing is applied."""
     given = load_settings(current.path, current.axis)
     applied = [key for key, restart in changed(current, given) if not restart]
     waiting = [key for key, restart in changed(started, given) if restart]

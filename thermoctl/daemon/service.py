@@ -126,16 +126,14 @@ def _state(settings: Settings) -> str:
 def stop(settings: Settings) -> int:
     """Disarm and stop the process that holds the rig; return 0 also when there is none.
 
-    It never asks: stopping is the safe direction. The rig of another configuration is not touched.
-    """
+    It never asks: stopping is the safe direction. The rig of another configuration is not touched."""
     pid = holder(settings)
     if pid is None:
         print("not running")
         return 0
     for part in settings.parts:
-        with contextlib.suppress(
-            InputError
-        ):  # a process that does not answer is ended, too; the amplifier is disabled when it ends
+        # A process that does not answer is ended, too; the amplifier is disabled when it ends.
+        with contextlib.suppress(InputError):
             ask(part.socket.path, {"command": "disarm"})
     unit = _unit_of(pid)
     if unit:
@@ -172,8 +170,7 @@ def log_path(settings: Settings) -> Path:
 class Background(subprocess.Popen[bytes]):
     """`thermoctl run` on a configuration, its log appended to `log_path` from position `began` on.
 
-    dies_with_us: stop it when this process ends, for whatever reason.
-    """
+    dies_with_us: stop it when this process ends, for whatever reason."""
 
     def __init__(self, settings: Settings, dies_with_us: bool = False):
         log = log_path(settings)
@@ -220,8 +217,7 @@ def unseen(settings: Settings) -> list[str]:
     """List the files that the unit could not read or write, each with its path and what to do.
 
     The unit sees no home and no temporary folder (ProtectHome=, PrivateTmp=), and writes only below
-    /var/lib/thermoctl and /run/thermoctl (ProtectSystem=strict).
-    """
+    /var/lib/thermoctl and /run/thermoctl (ProtectSystem=strict)."""
     problems, config = [], Path(settings.path).resolve()
     program = {
         "program": _program(),
@@ -287,8 +283,7 @@ def install(config: Path, root: Path = Path("/")) -> int:
     The first rig's unit is thermoctl.service, a further one's thermoctl-RIG.service; other rigs' units
     stay as they are. systemd is informed where `root` is the running system. Raises InputError where a
     file cannot be written or two rigs collide. It also does where the unit would not see its files; below
-    another root that is only a warning.
-    """
+    another root that is only a warning."""
     settings = load_rig(config)
     config = config.resolve()
     if hidden := unseen(settings):
@@ -344,8 +339,7 @@ def _say_whether_the_user_exists() -> None:
 def _unit_name(settings: Settings, config: Path, root: Path) -> str:
     """Return the unit that runs this configuration already, else a free name.
 
-    Raises InputError for a collision.
-    """
+    Raises InputError for a collision."""
     installed = units(root)
     for name, other in installed.items():
         if other == config:
@@ -371,8 +365,7 @@ def uninstall(config: Path | None, root: Path = Path("/")) -> int:
     """Stop and remove the unit of this configuration (None: the only one).
 
     With the last unit the shared files are removed, too. User and recordings stay. Returns 1 when no such
-    unit is installed.
-    """
+    unit is installed."""
     installed = units(root)
     chosen = [n for n, runs in installed.items() if config is None or runs == config.resolve()]
     if len(chosen) != 1:

@@ -71,8 +71,7 @@ LOOP_STOP_S = 3.0  # a loop that does not end within this time after the request
 def safe_amplifier(settings: Settings, log: Log) -> bool:
     """Disable the amplifier over a link of the supervisor's own, when the loop no longer can.
 
-    No other device is opened.
-    """
+    No other device is opened."""
     try:
         disable_amplifier(settings)
         return True
@@ -100,8 +99,7 @@ class _Notify:
 def run(settings: Settings, log: Log = console_log) -> int:
     """Run the daemon until SIGTERM or SIGINT; return its exit status.
 
-    Raises InputError when it cannot be started.
-    """
+    Raises InputError when it cannot be started."""
     take_over()
     bind(rig=rig_identity(settings))
     if not COMPILED:

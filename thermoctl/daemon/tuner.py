@@ -37,8 +37,7 @@ class Tuning:
     """Learns the expansion model from a rig's record rows and saves calibrations.
 
     Give the rows to `take` in order of time; `tuner` holds the state of learning. folder: where calibrations
-    are saved, or None to learn without saving; say(text): writes to the log.
-    """
+    are saved, or None to learn without saving; say(text): writes to the log."""
 
     def __init__(
         self,

@@ -56,8 +56,7 @@ def whole_file(path: str | Path, remedy: str = "", sync: bool = True) -> Iterato
     Mode and owner of an existing file are kept, and a link stays a link. A device or a pipe, such as
     /dev/stdout, is written directly. `remedy`: advice for the message of an error. `sync`: False for a file
     that is worthless after a power cut; nothing waits for the disk then. Raises WriteError; an existing file
-    is then unchanged.
-    """
+    is then unchanged."""
     with _reported(path, remedy):
         if _is_device(path):
             yield str(path)
@@ -86,8 +85,7 @@ def whole_files(folder: str | Path, remove: Iterable[str] = ()) -> Iterator[Path
 
     All files appear, or none. A new folder is renamed at once. In an existing one each file replaces its
     forerunner, and those named in `remove` are deleted; an error on the way restores everything. Only kill -9
-    between two renames can leave a mixture, of whole files. Raises WriteError.
-    """
+    between two renames can leave a mixture, of whole files. Raises WriteError."""
     folder = Path(os.path.realpath(folder))
     with _reported(folder, ""):
         new = not folder.exists()
@@ -142,8 +140,7 @@ def make_folder(folder: str | Path, remedy: str = "") -> Path:
 def part_file(target: Path) -> tuple[int, Path]:
     """Create the temporary file of `target`; return its descriptor, which holds a lock, and its path.
 
-    Raises OSError.
-    """
+    Raises OSError."""
     try:
         old: os.stat_result | None = target.stat()
     except FileNotFoundError:

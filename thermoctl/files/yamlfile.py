@@ -216,8 +216,7 @@ class Section:
     """A YAML mapping read key by key; `end()` refuses the keys that were not read.
 
     `what` names the mapping in errors; `of`, if given, names the item that its keys belong to ("noise of
-    'y'").
-    """
+    'y'")."""
 
     def __init__(self, node: Node, what: str, of: str = "") -> None:
         if not isinstance(node.value, dict):

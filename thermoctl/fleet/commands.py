@@ -118,8 +118,7 @@ def diagnose_folders(args: argparse.Namespace) -> int:
     """Run `thermoctl diagnose` over folders: every rig's newest recordings, with the result in OUT/RIG.
 
     The rigs are spread over processes or a Dask cluster. A rig that cannot be diagnosed is reported and does
-    not stop the others; completed rigs are not run again.
-    """
+    not stop the others; completed rigs are not run again."""
     if not Path(args.plant).is_file():
         raise InputError(f"{args.plant}: no such file; the plant of the fleet's rigs was expected")
     jobs, out = _jobs(args), Path(args.out)
@@ -187,8 +186,7 @@ def _diagnoses(found: Sequence[RigDiagnosis]) -> Table:
 def live_recordings(args: argparse.Namespace) -> list[str]:
     """Extract the data of `thermoctl diagnose --live` into OUT/live.csv, from the onset of the misfit on.
 
-    None if the model fits. Raises InputError if recordings were given, too.
-    """
+    None if the model fits. Raises InputError if recordings were given, too."""
     if args.recordings:
         raise InputError(
             "diagnose --live reads the daemon's own recordings; no recording was expected beside it"

@@ -169,8 +169,7 @@ class Bank:
         """Return the best Expansion whose static gains (M,) um/K lie within low..high.
 
         Collinear gains that the data cannot separate are fitted within the bounds, not clipped afterwards.
-        The criterion has, as in `output_error`, the ridge for the inputs' error.
-        """
+        The criterion has, as in `output_error`, the ridge for the inputs' error."""
         self._fold()
         m = self.inputs
         bounds = np.full((2, m + 2), [[-np.inf], [np.inf]])

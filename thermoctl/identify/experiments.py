@@ -11,18 +11,14 @@ can be resumed where it stopped.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import cycle, product
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from thermoctl.control import arming, faults
 from thermoctl.files.yamlfile import InputError, Node, Section, load
-from thermoctl.rig.signals import AT, fault_word
 
 FORMAT = "thermoctl-experiments/1"
 SETPOINT = "setpoint_um"
@@ -311,79 +307,6 @@ class Aborted(Exception):
     def __init__(self, reason: str, done_s: float):
         super().__init__(reason)
         self.reason, self.done_s = reason, done_s
-
-
-class ScheduleTarget(Protocol):
-    """A rig that runs a schedule: `daemon.offline.simulate.Simulation`, or another with the same methods."""
-
-    @property
-    def row(self) -> np.ndarray:
-        """Return the newest record row."""
-
-    @property
-    def period_s(self) -> float:
-        """Return the period of a tick, s."""
-
-    def arm(self) -> object:
-        """Arm the law."""
-
-    def command(self, name: str, value: float) -> object:
-        """Give the law a command."""
-
-    def tick(self, count: int) -> np.ndarray:
-        """Advance `count` ticks; return the newest record row."""
-
-
-def run(
-    simulation: ScheduleTarget,
-    schedule: Schedule,
-    every: int = 100,
-    start_s: float = 0.0,
-    progress: Callable[[Progress], None] | None = None,
-    stop: Callable[[], bool] = lambda: False,
-) -> Iterator[np.ndarray]:
-    """Run a schedule on a rig, which is armed first; yield blocks of record rows, every `every`-th tick.
-
-    Resumes at `start_s` of the schedule. Each block is given out before the next is computed, so an abort
-    loses nothing. Raises Aborted when the law leaves ARMED (the fault bits are named) or `stop()` turns true.
-    """
-    period = simulation.period_s
-    before = [(start_s, *c[1:]) for c in schedule.commands() if c[0] < start_s]
-    waiting = before[-1:] + [c for c in schedule.commands() if c[0] >= start_s]
-    ticks = round((schedule.duration_s - start_s) / period)
-    block, began, nxt, k = [], time.monotonic(), 0, 0
-    state = AT["state"]
-    if simulation.row[state] != arming.ARMED:
-        simulation.arm()
-    while k < ticks:
-        while nxt < len(waiting) and round((waiting[nxt][0] - start_s) / period) <= k:
-            simulation.command(waiting[nxt][1], waiting[nxt][2])
-            nxt += 1
-        coming = round((waiting[nxt][0] - start_s) / period) if nxt < len(waiting) else ticks
-        count = min(every - k % every, coming - k, ticks - k)
-        row = simulation.tick(count)
-        k += count
-        if k % every == 0:
-            block.append(row.copy())
-        if len(block) == 1000 or k == ticks:
-            yield from _stacked(block)
-            block = []
-            done = start_s + k * period
-            if progress is not None:
-                progress(Progress(done, schedule.duration_s, time.monotonic() - began))
-            if stop():
-                raise Aborted("stopped on request", done)
-        if row[state] != arming.ARMED:
-            yield from _stacked(block)
-            standing = [f.name for f in faults.decode(fault_word(row))]
-            raise Aborted(
-                f"the law left ARMED: {', '.join(standing) or 'no fault bit set'}", start_s + k * period
-            )
-
-
-def _stacked(rows: list[np.ndarray]) -> Iterator[np.ndarray]:
-    if rows:
-        yield np.array(rows)
 
 
 def _keys(node: Node, what: str, needed: set[str], optional: Collection[str] = ()) -> dict[str, Node]:

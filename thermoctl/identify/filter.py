@@ -75,8 +75,7 @@ class Kalman:
 def disturbed(model: StateSpace) -> StateSpace:
     """Return the model with one disturbance state: heat from outside into every body, the same K/s in each.
 
-    It decays with the time constant DECAY_S.
-    """
+    It decays with the time constant DECAY_S."""
     n, m = model.b.shape
     into = np.linalg.pinv(model.c, rcond=1e-3) @ np.ones(len(model.c)) * model.period_s
     a = np.zeros((n + 1, n + 1))

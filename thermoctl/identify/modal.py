@@ -119,8 +119,7 @@ def _responses(
 def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, float] | None) -> np.ndarray:
     """Filter stacked rows (J, columns) by the drift's whitening filter, each recording separately.
 
-    Without `drift_s` they are unchanged.
-    """
+    Without `drift_s` they are unchanged."""
     if drift_s is None:
         return rows
     forgotten, corner = (np.exp(-records[0].q * records[0].period_s / t) for t in drift_s)
@@ -133,8 +132,7 @@ def _whitened(rows: np.ndarray, records: list[Blocks], drift_s: tuple[float, flo
 def _response(blocks: Blocks, tau: np.ndarray, rest: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return block-mean responses F (J, columns), their derivative by ln tau, and each column's pole index.
 
-    Columns by pole: one per input, then (unless `rest`) the free decay.
-    """
+    Columns by pole: one per input, then (unless `rest`) the free decay."""
     q, basis, J = blocks.q, blocks.basis, len(blocks.u)
     i = np.arange(q)
     F, D, owner = [], [], []
@@ -179,8 +177,7 @@ class _Fit:
 def _project(F: np.ndarray, Y: np.ndarray, ridge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Q of F, the residue matrix and the residual.
 
-    A ridge of `ridge` times each column's norm keeps nearly equal poles harmless.
-    """
+    A ridge of `ridge` times each column's norm keeps nearly equal poles harmless."""
     n = F.shape[1]
     norm = np.linalg.norm(F, axis=0)
     norm[norm == 0] = 1

@@ -29,8 +29,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 class Calibration:
     """A model and its origin.
 
-    Rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}.
-    """
+    Rig name, `created` (UTC), fingerprints {file name: sha256}, figures {name: number}."""
 
     model: CompensatorModel
     rig: str

@@ -63,8 +63,7 @@ class StateSpace:
 
         Exact (2e-15 in A - I from 10 s to 1 ms); a linear scaling of A - I would be 25 % off. Identification
         itself runs at 1 to 10 s. At 1 ms a pole of 4000 s lies 2.5e-7 from 1, closer than noise can resolve.
-        Raises InputError when no real logarithm exists.
-        """
+        Raises InputError when no real logarithm exists."""
         if period_s == self.period_s:
             return self
         bad = [p for p in self.poles if abs(p.imag) < 1e-12 and p.real <= 1e-12]
@@ -88,8 +87,7 @@ class StateSpace:
     def minus_identity(self, period_s: float) -> np.ndarray:
         """Return A - I at a (short) period by the series of exp(F T) - I.
 
-        The subtraction from 1 would lose digits.
-        """
+        The subtraction from 1 would lose digits."""
         if self.poles.real.min() <= 0:
             self.resample(period_s)  # raises an error that names the pole
         f = np.real(linalg.logm(self.a)) * (period_s / self.period_s)

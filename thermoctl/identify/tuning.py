@@ -7,10 +7,6 @@ recorded position. This is the direct method of closed-loop identification (Ljun
 ed., section 13.5). The loop answers the noise of a sample one period later at the earliest. So white noise of
 the encoder does not bias the fit.
 
-Ziegler-Nichols (Table I): Kp = 1.2 tau_c/(K0 tau_d), Ti = 2 tau_d, Td = 0.5 tau_d, from the steepest tangent
-of the fitted step response. The steepest difference of noisy samples is too steep: with 0.15 um of noise Kp
-was 21 % low, fitted 0.1 %.
-
 Lambda / IMC (Rivera, Morari, Skogestad), with the half rule for faster lags than theta:
 
     series form     Kc = t1/(K0 (lambda + theta)), tI = t1, tD = t2
@@ -214,20 +210,6 @@ def tangent(model: SecondOrder) -> tuple[float, float, float]:
     return model.gain, float(t[k] - y[k] / slope[k]), float(1 / slope[k])
 
 
-def ziegler_nichols(model: SecondOrder, derivative: bool = True) -> Gains:
-    """Table I from the fitted step response; without derivative Ziegler and Nichols' PI controller."""
-    k0, tau_d, tau_c = tangent(model)
-    if not derivative:
-        return Gains(0.9 * tau_c / (k0 * tau_d), 3.33 * tau_d, 0.0, "Ziegler-Nichols, step, PI")
-    return Gains(
-        1.2 * tau_c / (k0 * tau_d),
-        2 * tau_d,
-        0.5 * tau_d,
-        "Ziegler-Nichols, step (Table I)",
-        {"K0": k0, "tau_d_s": tau_d, "tau_c_s": tau_c},
-    )
-
-
 def imc(model: SecondOrder, lambda_s: float | None = None, derivative: bool = True) -> Gains:
     """Lambda tuning; `lambda_s` (closed-loop time constant) defaults to the dead time, Skogestad's choice."""
     theta = model.theta_s
@@ -282,8 +264,7 @@ def controller_at(w: np.ndarray, gains: Gains, period_s: float) -> np.ndarray:
 def margins(model: SecondOrder, gains: Gains, period_s: float, moving_average: int = 1) -> Margins:
     """Return the margins of PID (41) at `period_s` on the model with a zero-order hold.
 
-    The moving average of `moving_average` samples is included.
-    """
+    The moving average of `moving_average` samples is included."""
     w, plant = _plant(model, period_s, moving_average)
     loop = controller_at(w, gains, period_s) * plant
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))

@@ -34,7 +34,7 @@ TABLE: Table = {
         ),
         command(
             "plant show",
-            "print a plant as tables, or draw its network",
+            "print a plant, also an FMU, as a plant file, or draw its network",
             "thermoctl.plant.commands:show",
             "",
             argument("plant", metavar="PLANT"),

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from thermoctl.files.safe_file import whole_file
-from thermoctl.files.yamlfile import InputError
+from thermoctl.files.yamlfile import InputError, dumps
 from thermoctl.plant import Plant, load, save
 from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
@@ -60,8 +60,7 @@ def _warn_of_tables(plant: Plant, recording: str, last: float) -> None:
 def simulate(args: argparse.Namespace, read: Reader | None = None) -> int:
     """Simulate freely, or predict `--horizon` seconds ahead, on one recording or several.
 
-    `read`: reads recordings. Prints figures; writes a file and a plot on request.
-    """
+    `read`: reads recordings. Prints figures; writes a file and a plot on request."""
     plant = load(args.plant, args.map)
     initial = _initial(plant, args)
     runs: list[tuple[Table, Excitation, np.ndarray, np.ndarray]] = []
@@ -310,14 +309,11 @@ def _errors(plant: Plant, table: Table) -> dict[str, float]:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Return the plant's table, and its picture when --out is given."""
+    """Print the plant as a plant file, or with --out draw it."""
     plant = load(args.plant)
     if args.out:
         drawing.draw(plant, args.out)
         print(args.out)
     else:
-        console = Console()
-        console.print(f"[bold]{plant.title}[/bold]  ({plant.file})")
-        for part in drawing.table(plant):
-            console.print(part)
+        print(dumps(plant.plain()), end="")
     return 0

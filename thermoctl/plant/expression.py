@@ -65,8 +65,7 @@ class Expr:
     - only in derivatives: 'fmu_slope', an 'fmu' whose value ends in the name that it is differentiated by
     - only in derivatives: 'dpow' (a**(b-1), 0 where a <= 0), 'table_slope', 'bump' (slope of a smoothed
       step);
-    - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed).
-    """
+    - only in derivatives: 'side' (1 or -1) and 'le' (1 where a <= b, never smoothed)."""
 
     op: str
     args: tuple[Expr, ...] = ()
@@ -506,8 +505,7 @@ def _text(e: Expr, outer: int) -> str:
 def derivative(expr: Expr, by: str) -> Expr:
     """Return d expr / d name, exact.
 
-    At kinks (abs, min, max, table) it is one-sided; a jump has the slope of its smooth form.
-    """
+    At kinks (abs, min, max, table) it is one-sided; a jump has the slope of its smooth form."""
     done: dict[int, Expr] = {}
     for node in walk(expr):
         done[id(node)] = _derive(node, by, done)

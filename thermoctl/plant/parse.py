@@ -281,8 +281,7 @@ def _expression(s: Section, key: str) -> Expr:
 class _Place:
     """An expression of the file, and the names and functions allowed in it.
 
-    `delays`: the arguments allowed in delay(): 'no', 'inputs' or 'all'.
-    """
+    `delays`: the arguments allowed in delay(): 'no', 'inputs' or 'all'."""
 
     what: str
     expression: Expr

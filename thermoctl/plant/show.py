@@ -1,4 +1,4 @@
-"""A plant as a picture (nodes, flows, outputs) and as a table.
+"""A plant as a picture: nodes, flows, outputs.
 
 The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by
 majorisation (Gansner, Koren, North 2004). Flows to and from the outside and outputs are small satellites of
@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from rich.table import Table
 
 from thermoctl.files.safe_file import whole_file
 from thermoctl.files.yamlfile import InputError
@@ -36,8 +35,7 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
     """Return vertices (kind, key, label) and edges (from, to, kind, label).
 
     A node has one satellite for its inflows, one for its outflows and one for its readings. A reading of
-    several nodes is a vertex of its own.
-    """
+    several nodes is a vertex of its own."""
     vertices = [("node", n.name, f"{n.name}\n[{n.unit}]" if n.unit else n.name) for n in plant.nodes.values()]
     index = {n: i for i, n in enumerate(plant.nodes)}
     edges: list[Edge] = []
@@ -80,8 +78,7 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
 def _edge(box: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> np.ndarray:
     """Return the intersection of the line from `outside` (2,) to `inside` (2,) with the box round `inside`.
 
-    box: [[left, bottom], [right, top]].
-    """
+    box: [[left, bottom], [right, top]]."""
     way = outside - inside
     room = np.where(way > 0, box[1] - inside, inside - box[0]) / np.maximum(np.abs(way), 1e-12)
     return inside + way * min(float(room.min()), 1.0)
@@ -300,49 +297,3 @@ def _legend(axes: Axes, low: np.ndarray, right: float, canvas: FigureCanvasAgg, 
         text.set_position((left + 0.05, float(low[1]) - 0.2 - 0.26 * row))
         left += width + 0.12
     return 0.4 + 0.26 * row
-
-
-def table(plant: Plant) -> list[Table]:
-    """Return the plant as rich tables: inputs, parameters, nodes, flows, outputs."""
-
-    def make(title: str, heads: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> Table:
-        """Return a table; floats have 6 significant digits, None is an empty cell."""
-        made = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
-        for head in heads:
-            right = head in ("low", "high", "noise", "step") or (head == "value" and title == "Parameters")
-            made.add_column(head, justify="right" if right else "left", overflow="fold")
-        for row in rows:
-            made.add_row(*("" if q is None else f"{q:.6g}" if isinstance(q, float) else str(q) for q in row))
-        return made
-
-    parts = [
-        make(
-            "Inputs",
-            ("name", "unit", "column", "between samples"),
-            [(i.name, i.unit, i.column, "linear" if i.linear else "hold") for i in plant.inputs.values()],
-        ),
-        make(
-            "Parameters",
-            ("name", "value", "unit", "low", "high"),
-            [(p.name, p.value, p.unit, *(p.range or (None, None))) for p in plant.parameters.values()],
-        ),
-        make(
-            "Nodes",
-            ("name", "unit", "storage", "initial"),
-            [(n.name, n.unit, n.storage, n.initial) for n in plant.nodes.values()],
-        ),
-        make(
-            "Flows",
-            ("name", "from", "into", "rate", "unit"),
-            [
-                (f.name, f.source or "(outside)", f.target or "(outside)", f.rate, f.unit)
-                for f in plant.flows.values()
-            ],
-        ),
-        make(
-            "Outputs",
-            ("name", "value", "unit", "noise", "step"),
-            [(o.name, o.value, o.unit, o.noise, o.resolution) for o in plant.outputs.values()],
-        ),
-    ]
-    return [p for p in parts if p.row_count]

@@ -57,8 +57,7 @@ def history(
 
     names: the rig's signals. invalid(columns of status bits, metadata, signal) marks the samples to omit
     (readings.invalid); None keeps all. Empty when nothing is recorded.
-    Raises InputError for an unknown signal, an empty span, or points outside 2..MAX_POINTS.
-    """
+    Raises InputError for an unknown signal, an empty span, or points outside 2..MAX_POINTS."""
     if signal not in names:
         raise InputError(f"history: no signal '{signal[:60]}'{suggest(signal, names)}")
     if not (np.isfinite([begin_s, end_s]).all() and 0.0 <= begin_s < end_s <= 1e11):
@@ -88,8 +87,7 @@ def history(
 def reduce(bucket: np.ndarray, low: np.ndarray, mean: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
     """Reduce samples of the same bucket to (bucket numbers, minimum, mean, maximum).
 
-    The buckets need not be in order, because the clock may step.
-    """
+    The buckets need not be in order, because the clock may step."""
     if not len(bucket):
         return bucket, low, mean, high
     if (np.diff(bucket) < 0).any():

@@ -86,29 +86,25 @@ def info(path: str | Path) -> Info:
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:
     """Return (ticks (n, signals) in the order of its rig's signals, text `law` of the metadata) for a replay.
 
-    Raises InputError when a signal is missing (a tier, or a recording of another version).
-    """
+    Raises InputError when a signal is missing (a tier, or a recording of another version)."""
     table = read_table(path)
     if "10 Hz" in table.meta.get("tier", ""):
         raise InputError(f"{path}: no full-rate recording but its 10 Hz tier; a replay needs every tick")
     row = of_recording(table.meta)
-    before = {s.name: s.before for s in row.signals if s.before is not None}
-    columns = {n: np.full(len(table), number) for n, number in before.items()} | dict(table.columns)
-    missing = [n for n in row.names if n not in columns]
+    missing = [n for n in row.names if n not in table.columns]
     if missing:
         raise InputError(
             f"{path}: no full-rate recording of this version: {', '.join(missing[:3])} "
             f"{'is' if len(missing) == 1 else 'are'} missing; replay it with the version that recorded it"
         )
-    return np.column_stack([columns[n] for n in row.names]), table.meta.get("law", "")
+    return np.column_stack([table.columns[n] for n in row.names]), table.meta.get("law", "")
 
 
 def recover(path: str | Path, out: str | Path) -> Info:
     """Copy the complete batches of a truncated recording to `out` and close it properly.
 
     Any Arrow reader opens the copy; its summary is returned. Raises InputError when nothing can be read or
-    `out` exists.
-    """
+    `out` exists."""
     path, out = Path(path), Path(out)
     stream = open_stream(path)
     for _ in stream:

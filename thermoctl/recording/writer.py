@@ -124,8 +124,7 @@ def _write_all(fd: int, data: bytes) -> None:
 class Tier:
     """Reduce rows to min, mean and max over each tenth of a second; words of bits are or-ed.
 
-    NaN is a missing sample.
-    """
+    NaN is a missing sample."""
 
     def __init__(self, signals: Sequence[Signal]):
         names = [s.name for s in signals]
@@ -147,8 +146,7 @@ class Tier:
     def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
         """Return the rows (m, len(self.signals)) that `rows` (k, signals) complete.
 
-        `last` completes the row in progress.
-        """
+        `last` completes the row in progress."""
         rows = np.concatenate((self._open, rows))
         bins = np.floor(rows[:, self.clock] * TIER_HZ + 1e-6)
         ends = np.flatnonzero(np.diff(bins)) + 1

@@ -54,8 +54,7 @@ class Channel:
     `low` and `high` bound a plausible reading. `signal` is its column in a recording (default: the role).
     `point` is the name of a temperature point. A `thermal` sensor follows its body slowly, and its
     delay is recorded. A `code` is a state or an error number: it is constant in normal operation, so it is
-    never checked for `frozen`.
-    """
+    never checked for `frozen`."""
 
     role: str
     unit: str
@@ -183,8 +182,7 @@ class AxesChannels(Channels):
     """The channels of all axes in one sample: those of the first axis, then those of the next.
 
     A role is AXIS.CHANNEL. A channel of `shared` also has a role without an axis. Its reading is stored in
-    the first axis' place, and copied to its places in the other axes.
-    """
+    the first axis' place, and copied to its places in the other axes."""
 
     axes: tuple[tuple[str, Channels], ...] = ()
     shared: tuple[str, ...] = ()
@@ -248,8 +246,7 @@ def read_points(node: Node, folder: Path, shared: Iterable[Point] = ()) -> Chann
     """Read `points` of a rig file: a mapping name: {role, label}, or the path of a file that holds one.
 
     `folder` is what the path is relative to; shared: further points, those of all axes. Raises InputError
-    for a name that is not a plain word or stands in both, no coil or several, more than MAX_POINTS.
-    """
+    for a name that is not a plain word or stands in both, no coil or several, more than MAX_POINTS."""
     points = [*_listed(node, folder), *shared]
     if twice := {p.name for p in points if [q.name for q in points].count(p.name) > 1}:
         raise node.error(f"points: '{min(twice)}' is a point of all axes already; choose another name")

@@ -20,7 +20,7 @@ from math import inf
 
 import numpy as np
 
-from thermoctl.rig.channels import COIL, DEFAULT, FIXED, STATUS_NAMES, Channels, of_text
+from thermoctl.rig.channels import DEFAULT, FIXED, STATUS_NAMES, Channels, of_text
 
 FAULT_WORD_BITS = 53
 """A float64 holds 53 bits exactly: the faults from this bit on are in `fault_bits_2`."""
@@ -32,9 +32,7 @@ FRESH_PER_WORD, STATUS_PER_WORD, DELAYS_PER_WORD = 52, 26, 13
 class Signal:
     """One column of a recording: `unit` as pint reads it ('1' for a number), plausible from `low` to `high`.
 
-    `bits`: a word of bits; rows are merged by OR. `before`: its value in every recording made before the
-    signal existed; None when it is unknown.
-    """
+    `bits`: a word of bits; rows are merged by OR."""
 
     name: str
     unit: str
@@ -42,7 +40,6 @@ class Signal:
     low: float = -inf
     high: float = inf
     bits: bool = False
-    before: float | None = None
 
 
 _LOOP = (
@@ -73,7 +70,6 @@ _OUTPUTS = (
         f"the same for the faults from bit {FAULT_WORD_BITS} on, which is bit 0 of this word",
         0.0,
         bits=True,
-        before=0.0,
     ),
     Signal("setpoint_um", "um", "where the output shall be"),
     Signal("reference_um", "um", "the setpoint after its rate limiter"),
@@ -110,8 +106,7 @@ class Row:
     """The record row of a rig: its signals, their index, and where its parts lie.
 
     Slices: `readings` (all channels), `measured` (the points among them), `estimates` (of the points), and
-    the words of bits `fresh`, `status`, `delay`.
-    """
+    the words of bits `fresh`, `status`, `delay`."""
 
     def __init__(self, channels: Channels):
         self.channels = channels
@@ -182,14 +177,8 @@ def of_recording(meta: Mapping[str, str]) -> Row:
 
 
 def recorded_states(columns: Mapping[str, np.ndarray], meta: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Return the status of each channel, OK to ABSENT, from a recording's columns of status words.
-
-    A recording without the metadata `points` is of a version that had the amplifier's channels last.
-    """
+    """Return the status of each channel, OK to ABSENT, from a recording's columns of status words."""
     names = of_recording(meta).channels.names
-    if "points" not in meta:
-        amplifier = slice(COIL - 4, COIL - 1)
-        names = (*names[: amplifier.start], *names[amplifier.stop :], *names[amplifier])
     packed = np.column_stack([columns[n] for n in words("status", len(names), STATUS_PER_WORD)])
     return dict(zip(names, _unpack(packed, len(names), STATUS_PER_WORD, 2).T, strict=True))
 

@@ -1,8 +1,8 @@
 """Define the interface between the control loop and the hardware.
 
 A back end has `open()`, `read(now_s) -> Sample`, `write(drive, enable)` and `close()`. `hal.backend` in the
-configuration selects it: real devices (serial, CAN, Modbus), the simulated plant or a replayed recording. A
-fault injector can wrap any of them. thermoctl_hal.rig.make creates them.
+configuration selects it: real devices (serial, CAN, Modbus) or the simulated plant. A fault injector can wrap
+either. thermoctl_hal.rig.make creates them.
 
 - `open()` may block. It drives nothing: the amplifier is disabled afterwards. It raises HardwareError (one
   line: device, port, expectation, remedy), or yamlfile.InputError for a wrong configuration. A device without
@@ -17,8 +17,7 @@ fault injector can wrap any of them. thermoctl_hal.rig.make creates them.
 - `close()` disables the amplifier first, then releases every device. It may be called twice, and after a
   failed open.
 - `now_s` is in seconds. Real devices need the clock that every process shares (CLOCK_MONOTONIC,
-  `time.monotonic()`). The simulated and replayed back ends take any clock, so they can run faster than real
-  time.
+  `time.monotonic()`). The simulated back end takes any clock, so it can run faster than real time.
 
 A sample has arrays over the rig's channels (thermoctl/rig/channels.py), in their order:
 

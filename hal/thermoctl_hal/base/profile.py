@@ -183,9 +183,8 @@ class Dbc(BusSpec):
 
     file: Path
     database: Database = field(compare=False)
-    node_shift: int = (
-        -1
-    )  # number of bits by which the device's address is shifted in each identifier; -1: it is no part of it
+    # Number of bits by which the device's address is shifted in each identifier; -1: it is no part of it.
+    node_shift: int = -1
     faults: Mapping[str, str] = field(default_factory=dict)  # MESSAGE or MESSAGE.SIGNAL -> why it is unusable
     warning: str = ""  # file, line and message of what was read in spite of a fault
 

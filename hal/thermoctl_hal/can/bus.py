@@ -39,17 +39,8 @@ from thermoctl_hal.base.wire import EXTENDED, CanPort, SlcanLine
 MAX_TAKEN = 500  # most frames that one tick takes from a bus: bounds the time of a tick on a full bus
 READ_S = 0.1  # longest wait of a reading thread before it checks whether it has to end
 MAX_REFUSED = 100  # the bus counts as lost after so many refused frames in a row
-_SLCAN_BITRATES = {
-    10_000: 0,
-    20_000: 1,
-    50_000: 2,
-    100_000: 3,
-    125_000: 4,
-    250_000: 5,
-    500_000: 6,
-    800_000: 7,
-    1_000_000: 8,
-}
+# A bitrate's place is its number in the command S of Lawicel.
+_SLCAN_BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
 SLCAN_BAUD = 3_000_000
 SHARED = ("socketcan", "virtual", "udp_multicast")  # any number of programs and devices may open these
 KERNEL_ERRORS = ("gs_usb", "socketcan", "socketcand")  # interfaces with the kernel's error frames
@@ -92,7 +83,7 @@ class SlcanPort(SlcanLine):
             )
         self._port = open_port(path, LineSettings(baud=baud))
         super().__init__(self._port.fileno())
-        os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES[bitrate])
+        os.write(self._port.fileno(), b"\r\rC\rS%d\rO\r" % _SLCAN_BITRATES.index(bitrate))
 
     @property
     def bad(self) -> int:

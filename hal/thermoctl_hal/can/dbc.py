@@ -222,8 +222,7 @@ class DbcDrive(Commanded, DbcDevice):
     """An amplifier that takes messages of a DBC file.
 
     A frame with the identifier of a message of ours is another master's, unless it is the echo of one that
-    we sent. A message of which a channel is bound comes from the amplifier, too, and is not checked.
-    """
+    we sent. A message of which a channel is bound comes from the amplifier, too, and is not checked."""
 
     def __init__(self, binding: Binding) -> None:
         super().__init__(binding)

@@ -40,9 +40,8 @@ _TYPE = re.compile(r"\s*SIG_VALTYPE_\s+(\d+)\s+(\S+?)\s*:?\s*([0-3])\s*;")
 _EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
 _FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
 _FORMAT_OF = re.compile(r'\s*BA_\s+"VFrameFormat"\s+BO_\s+(\d+)\s+([^;]*);')
-_KIND = re.compile(
-    r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE
-)  # a line without which numbers are wrong
+# The lines without which numbers are wrong.
+_KIND = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE)
 _PAGE = re.compile(r"m\d")
 _WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
 _WORDS = re.compile(r'\s*VAL_\s+(\d+)\s+\S+(?:\s+-?\d+\s+"[^"]*")+\s*;\s*')

@@ -115,7 +115,11 @@ def read_eds(path: Path) -> Eds:
             "it has no section of an object, as [6041]; of an XDD or ESI file (XML) the maker's tool saves an EDS "
             "file, or give the types of the objects as 'objects'"
         )
-    _add_compact(entries)
+    # The sub-indices that CompactSubObj counts have the type of their object.
+    for item, entry in list(entries.items()):
+        count = _number(entry.keys.get("compactsubobj", ""))
+        for sub in range(1, min(count or 0, LAST_SUB) + 1):
+            entries.setdefault(Object(item.number, sub), Entry(entry.line, keys=entry.keys))
     remarks += _odd(entries)
     remarks.sort()
     more = f"; and {len(remarks) - 1} more" if len(remarks) > 1 else ""
@@ -152,14 +156,6 @@ def _sections(lines: list[str]) -> tuple[dict[Object, Entry], list[tuple[int, st
             entry.keys.setdefault(key.strip().lower(), value[0].strip())
     lost = ((n, i) for i, n in counts.items() if Object(i) not in entries)
     return entries, remarks + [(n, f"[{i:04X}sub0] has no object [{i:04X}]") for n, i in lost]
-
-
-def _add_compact(entries: dict[Object, Entry]) -> None:
-    """Add the sub-indices that `CompactSubObj` counts; all have the type of their object."""
-    for item, entry in list(entries.items()):
-        count = _number(entry.keys.get("compactsubobj", ""))
-        for sub in range(1, min(count or 0, LAST_SUB) + 1):
-            entries.setdefault(Object(item.number, sub), Entry(entry.line, keys=entry.keys))
 
 
 def _odd(entries: dict[Object, Entry]) -> Iterator[tuple[int, str]]:

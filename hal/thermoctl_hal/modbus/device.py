@@ -182,8 +182,8 @@ class ModbusDevice(Device):
             except NoAnswer as e:
                 self.counts["lost"] += 1
                 self._lost_polls += 1
-                for i in self._bounds(block):
-                    self.miss(i, f"{self._named(block)}: {e}")
+                for k, _ in block.members:
+                    self.miss(self._items[k][0], f"{self._named(block)}: {e}")
                 if self._lost_polls >= LOST_POLLS:
                     raise HardwareError(f"{self.binding.port}: {self._named(block)}: {e}") from None
                 at = self._blocks.index(block)
@@ -194,13 +194,9 @@ class ModbusDevice(Device):
                 ):
                     # The device may not answer if a block has gaps.
                     again = plan_blocks(block.members, 0, self._spec.max_block)
-                self._blocks = (
-                    self._blocks[at + 1 :] + self._blocks[:at] + again
-                )  # the next poll starts after it
+                # The next poll starts after it.
+                self._blocks = self._blocks[at + 1 :] + self._blocks[:at] + again
                 return
-
-    def _bounds(self, block: Block) -> list[int]:
-        return [self._items[k][0] for k, _ in block.members]
 
     def silence(self) -> str:
         """Report that the poller has posted no reading and no problem yet."""

@@ -219,7 +219,9 @@ class Link:
 
     def _ask_once(self, message: Any, timeout_s: float) -> bytes:
         """Send a request and wait for its answer. Raises NoAnswer, _Closed, OSError."""
-        request = self._framed(message)
+        self._transaction = message.transaction_id = self._transaction % 0xFFFF + 1
+        frame = self._framer.buildFrame(message)
+        request = _Request(message.dev_id, _pdu(message), frame, self._transaction)
         key = request.unit, request.function
         if key in self._lost:
             self._catch_up(request, timeout_s)
@@ -245,11 +247,6 @@ class Link:
         """Keep the silence that must follow an RTU frame."""
         characters = GAP_CHARACTERS * (2 + self.line.data_bits + self.line.stop_bits) / self.line.baud
         self._free_s = time.monotonic() + (max(GAP_MIN_S, characters) if self._is_rtu else 0.0)
-
-    def _framed(self, message: Any) -> _Request:
-        self._transaction = message.transaction_id = self._transaction % 0xFFFF + 1
-        frame = self._framer.buildFrame(message)
-        return _Request(message.dev_id, _pdu(message), frame, self._transaction)
 
     def _drop(self) -> None:
         """Drop the bytes that came before this request. Raises _Closed, OSError."""
@@ -284,13 +281,6 @@ class Link:
         del self._late[unit]
         self._lost = {key for key in self._lost if key[0] != unit}
 
-    def _note_echoes(self, data: bytes) -> None:
-        """Notice answers to function 8, whichever unit is asked at present."""
-        for unit, echo in list(self._late.items()):
-            echo.received = (echo.received + data)[-CHUNK:]
-            if echo.is_answered(self._echoes):
-                self._caught_up(unit)
-
     def _take(self) -> bytes:
         try:
             data = os.read(self._line.fileno(), CHUNK)
@@ -298,7 +288,10 @@ class Link:
             return b""
         if not data:
             raise _Closed
-        self._note_echoes(data)
+        for unit, echo in list(self._late.items()):  # answers to function 8, whichever unit is asked now
+            echo.received = (echo.received + data)[-CHUNK:]
+            if echo.is_answered(self._echoes):
+                self._caught_up(unit)
         return data
 
     def _send(self, data: bytes, end_s: float) -> None:

@@ -11,8 +11,7 @@ class AxisBackend:
     """`thermoctl_hal.base.backend.Backend` of one axis.
 
     The first axis reads all devices; the others, which tick after it, see what it read. Opening or closing
-    one axis opens or closes all devices.
-    """
+    one axis opens or closes all devices."""
 
     def __init__(self, devices: DevicesBackend, channels: AxesChannels, axis: str):
         self.devices, self.name, self.axis = devices, axis, list(channels.parts).index(axis)

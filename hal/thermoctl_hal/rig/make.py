@@ -17,11 +17,8 @@ from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.devices import DevicesBackend
 from thermoctl_hal.simulated.faulty import FaultInjector, schedule
 
-PLAYED = {
-    "simulated": "thermoctl_hal.simulated.rig:simulated_backend",
-    "replay": "thermoctl_hal.simulated.replay:replay_backend",
-}
-"""Back ends without devices: imported where one is asked for, because they load the plant's packages."""
+SIMULATED = "thermoctl_hal.simulated.rig:simulated_backend"
+"""Imported where it is asked for, because it loads the plant's packages."""
 
 
 def make_backend(settings: Settings, board: Board | None = None) -> Backend:
@@ -37,8 +34,7 @@ def make_backend(settings: Settings, board: Board | None = None) -> Backend:
 def make_backends(settings: Settings, board: Board | None = None) -> list[Backend]:
     """Make the back end of each axis, not yet open; of a rig without axes the only one. See make_backend.
 
-    Devices are opened once, with the first of them, and read once a tick, by the first of them.
-    """
+    Devices are opened once, with the first of them, and read once a tick, by the first of them."""
     if not isinstance(settings.channels, AxesChannels):
         return [make_backend(settings, board)]
     if settings.hal.backend != "devices":
@@ -61,10 +57,10 @@ def _plain_backend(settings: Settings, board: Board | None) -> Backend:
     kind = settings.hal.backend
     if kind == "devices":
         return _devices_backend(settings, board)
-    if kind in PLAYED:
-        played: Backend = part(PLAYED[kind])(settings)
-        return played
-    raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated, devices or replay")
+    if kind == "simulated":
+        simulated: Backend = part(SIMULATED)(settings)
+        return simulated
+    raise ValueError(f"hal.backend is {kind!r}; settings.py allows simulated or devices")
 
 
 def _with_faults(backend: Backend, settings: Settings) -> Backend:

@@ -110,15 +110,12 @@ class Probe:
             role = ROLE[b.role]
             value, problem = float(self.sample.value[role]), ""
             if self.sample.status[role] != OK:
-                problem = self._problem(role)
+                outside = "outside its range" if self.sample.status[role] == ERROR else "not read"
+                device = self.device
+                problem = outside if device is None else device.problems.get(role) or device.silence()
             raw = (value - b.offset) / b.scale if not math.isnan(value) else math.nan
             readings.append(Reading(b.channel.name, raw, value, b.channel.unit, problem))
         return readings
-
-    def _problem(self, role: int) -> str:
-        if self.device is None:
-            return "outside its range" if self.sample.status[role] == ERROR else "not read"
-        return self.device.problems.get(role) or self.device.silence()
 
 
 def read_for(probe: Probe, seconds: float) -> list[Reading]:

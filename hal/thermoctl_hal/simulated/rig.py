@@ -111,9 +111,8 @@ class PlantRig:
         self.stepper = model.stepper(period_s, self.u)
         self._draw = _draws(np.random.default_rng(seed)).__next__
         self.y = self.stepper.step(self.u)
-        self.index = _roles_of_outputs(
-            path, model.outputs, roles, channels.names
-        )  # sensors of the surroundings have the numbers after the outputs
+        # Sensors of the surroundings have the numbers after the outputs.
+        self.index = _roles_of_outputs(path, model.outputs, roles, channels.names)
         outputs = [plant.outputs[n] for n in model.outputs]
         self._noise = [o.noise.white if isinstance(o.noise, SensorNoise) else o.noise or 0.0 for o in outputs]
         self._noise += [s.noise for _, s in self._surroundings]

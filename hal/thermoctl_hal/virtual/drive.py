@@ -80,8 +80,7 @@ class Cia402Drive:
 
     `command_object` is the target object (0x2071, 0x6071 or 0x607A). With `alive` False the drive has no
     power and is mute. With `heartbeat` False it sends no heartbeat. Its stop input is active until
-    `stop_until_s`.
-    """
+    `stop_until_s`."""
 
     node: int
     command_object: int = 0x2071

@@ -6,7 +6,8 @@ It loads neither numpy nor the loop.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 from thermoctl.daemon.answers.sources import FIXED_SOURCES
@@ -47,8 +48,7 @@ def span(seconds: float | None) -> str:
 def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the faults as lines of a terminal.
 
-    Each cause has its time, its devices' messages and its remedy; its consequences follow.
-    """
+    Each cause has its time, its devices' messages and its remedy; its consequences follow."""
     lines: list[str] = []
     listed = list(standing)
     for f in listed:
@@ -74,8 +74,7 @@ def fault_lines(standing: Iterable[Mapping[str, Any]]) -> list[str]:
 def value_lines(status: Mapping[str, Any]) -> list[str]:
     """List a status' values as lines of a terminal.
 
-    An invalid value is '-' with its state and age.
-    """
+    An invalid value is '-' with its state and age."""
     by_role = status["readings"]
     shown_or = {
         name: number(status[name], 3)
@@ -118,8 +117,7 @@ def message_lines(status: Mapping[str, Any]) -> list[str]:
     """List a line for each invalid reading, with its device's message.
 
     In FAULT also readings that are valid again are listed. Then comes what cannot be saved, and the drive's
-    newest error code.
-    """
+    newest error code."""
     lines = []
     for role, r in status["readings"].items():
         said = f": {r['message']} (since {clock(r['message_wall_s'])})" if r["message"] else ""
@@ -149,6 +147,12 @@ def counter_lines(status: Mapping[str, Any]) -> list[str]:
         for device, counts in status.get("device_counters", {}).items()
         if any(count for name, count in counts.items() if name not in _NORMAL)
     ]
+
+
+def between(bins: Iterable[Sequence[float]], edges: Sequence[float]) -> list[float]:
+    """Return the counts of a histogram, (us, count) each, between neighbouring edges."""
+    bins = list(bins)
+    return [sum(count for us, count in bins if low <= us < high) for low, high in pairwise(edges)]
 
 
 def clock(wall_s: float) -> str:

@@ -28,8 +28,7 @@ UNBOUND_MESSAGE = "no device of hal.devices has this role"
 def verdict(status: int, kind: float) -> str:
     """Return a channel's state: OK, ABSENT, or the error found by the device (status) or the law (kind).
 
-    Errors are ERROR, STALE, RANGE, RATE and FROZEN.
-    """
+    Errors are ERROR, STALE, RANGE, RATE and FROZEN."""
     state = STATUS_NAMES[status]
     if state == "OK" and kind > 0.0:
         return faults.KINDS[int(kind) - 1].upper()
@@ -40,8 +39,7 @@ def readings(shared: Shared, row: np.ndarray) -> dict[str, dict[str, Any]]:
     """Return every channel of the newest row: value (null unless OK), last, state, age_s, message.
 
     The message is the device's newest one, with its time (seconds since 1970); it stays when the channel
-    is valid again.
-    """
+    is valid again."""
     statuses, by_role = shared.row.states(row)[0], {}
     values = row[shared.row.readings]
     begin_s = row[AT["wall_s"]] - row[AT["t_s"]]
@@ -81,8 +79,7 @@ def hide_invalid(rows: np.ndarray, name: str, layout: Row) -> np.ndarray:
 def invalid(columns: Mapping[str, np.ndarray], meta: Mapping[str, str], name: str) -> np.ndarray:
     """Return for each row of a recording whether a channel of this signal is stale or in error.
 
-    columns: the recording's words of status bits; meta: its metadata.
-    """
+    columns: the recording's words of status bits; meta: its metadata."""
     states = recorded_states(columns, meta)
     bad = np.zeros(len(next(iter(columns.values()))), bool)
     for role in sources(of_recording(meta).channels).get(name, ()):
@@ -93,8 +90,7 @@ def invalid(columns: Mapping[str, np.ndarray], meta: Mapping[str, str], name: st
 def drive_code(shared: Shared, row: np.ndarray) -> dict[str, Any] | None:
     """Return the drive's newest error code with text and time; None where there was none.
 
-    It is kept after the drive's reset.
-    """
+    It is kept after the drive's reset."""
     code, at_s = (float(shared.areas["remark_numbers"][k]) for k in (CODE, CODE_S))
     if not code:
         return None
@@ -138,12 +134,12 @@ def _described(
     """Return a fault as `status` shows it. begin_s: seconds since 1970 at t_s = 0.
 
     `late_s` is the machine's delay before it. `late_first`: that is the likely cause, because the reading's
-    device states none of its own.
-    """
+    device states none of its own."""
     row = faults.BY_NAME[fault.name]
     hit = _hit(fault, found, begin_s, channels)
     loss, reading = _loss(fault, hit, found, now_s)
-    is_stated = loss is not None and (loss.is_certain or (loss is not losses.SLOW and _is_old(reading)))
+    is_old = (reading.get("age_s") or 0.0) > losses.LATE_WINDOW_S
+    is_stated = loss is not None and (loss.is_certain or (loss is not losses.SLOW and is_old))
     late_s = fault.late_s if fault.may_be_late and not cause else 0.0
     return {
         "name": fault.name,
@@ -191,10 +187,6 @@ def _loss(
         if loss is not None:
             return loss, found[role]
     return None, {}
-
-
-def _is_old(reading: Mapping[str, Any]) -> bool:
-    return (reading["age_s"] or 0.0) > losses.LATE_WINDOW_S
 
 
 def _remedy(loss: losses.Loss, reading: Mapping[str, Any], now_wall_s: float) -> str:

@@ -45,8 +45,7 @@ def status(shared: Shared) -> dict[str, Any]:
 
     A number whose reading is invalid is null; `readings` has its state, age and message. Without a model
     the estimates are null, too. `output_is` says whether the output is measured by a second encoder or only
-    expected by the model. Faults have the cause first.
-    """
+    expected by the model. Faults have the cause first."""
     row = shared.ring.newest()
     if row is None:
         return {

@@ -50,8 +50,7 @@ from thermoctl_hal.rig.make import (
 def check(settings: Settings) -> int:
     """Check the configuration, the model, the plant and the profiles; no hardware is touched.
 
-    Returns 1 where the rig could never be armed.
-    """
+    Returns 1 where the rig could never be armed."""
     with _drivers(settings):
         make_backends(settings)  # back ends of all axes
     return _each_axis(settings, _check) if settings.axes else _check(settings)
@@ -194,20 +193,16 @@ def _print_channels(settings: Settings, backend: Backend, found: _Readings, seco
             count, most_hz = max(count, found.frames[f"{name}.frames"]), math.inf
         rate_hz = count / seconds
         problem = backend.problem(role) or slow(role, rate_hz, expected, most_hz)
+        if not problem and role == "amplifier_state" and sample.value[k] in range(len(AMPLIFIER_STATES)):
+            problem = AMPLIFIER_STATES[int(sample.value[k])]
         of = f" of {expected[role]:g}" if role in expected else ""
         print(
             f"{role:24}{sample.value[k]:14.4f} {channel.unit:8}{state:8}{rate_hz:7.1f}{of} Hz"
-            + (f"   {problem or _in_words(role, sample.value[k])}".rstrip())
+            + f"   {problem}".rstrip()
         )
     if counters := backend.counters():
         print("counters: " + ", ".join(f"{name} {count}" for name, count in counters.items()))
     return bad
-
-
-def _in_words(role: str, value: float) -> str:
-    """Return what the amplifier's state means, '' for other channels."""
-    has_words = role == "amplifier_state" and value in range(len(AMPLIFIER_STATES))
-    return AMPLIFIER_STATES[int(value)] if has_words else ""
 
 
 @dataclass(frozen=True)
@@ -281,9 +276,8 @@ def _interrupts(base: Path, cpu: int) -> Check:
     mine = []
     for irq in sorted((base / "proc/irq").glob("[0-9]*"), key=lambda p: int(p.name)):
         allowed = _text(irq / "effective_affinity_list") or _text(irq / "smp_affinity_list")
-        if cpu in cpu_list(allowed) and any(
-            p.is_dir() for p in irq.iterdir()
-        ):  # a directory names its handler
+        # A directory names its handler.
+        if cpu in cpu_list(allowed) and any(p.is_dir() for p in irq.iterdir()):
             mine.append(irq.name)
     shown = ", ".join(mine[:8]) + (", .." if len(mine) > 8 else "")
     return Check(

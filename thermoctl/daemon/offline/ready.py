@@ -27,8 +27,7 @@ def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
     """List what keeps this rig, or one axis, from being armed: (True, sentence with file:line:column).
 
     (False, sentence): the same for a channel that is not required, which gives a lasting warning. Raises
-    InputError.
-    """
+    InputError."""
     protection, period_s = settings.protection, settings.loop.period_s
     if protection.late_s <= period_s:
         yield (

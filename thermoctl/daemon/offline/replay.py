@@ -24,8 +24,7 @@ class Replay:
     """Result of a replay.
 
     `ticks` compared, `skipped` before the stored state; `differences` {signal: (ticks that differ, first
-    of them, largest difference)}; `outputs` (ticks, outputs) of this replay.
-    """
+    of them, largest difference)}; `outputs` (ticks, outputs) of this replay."""
 
     ticks: int
     skipped: int
@@ -39,8 +38,7 @@ def replay(rows: np.ndarray, law_metadata: str, name: str = "recording") -> Repl
     A recording of this law's version has its fault bits: a bit is never given to another fault
     (control/faults.py).
 
-    Raises InputError when the metadata is missing or damaged, or ticks are missing.
-    """
+    Raises InputError when the metadata is missing or damaged, or ticks are missing."""
     try:
         metadata = read_law_metadata(law_metadata)
         law = Law(metadata["model"], metadata["parameters"], float(metadata["period_s"]))

@@ -24,9 +24,8 @@ class Simulation:
 
     `row` is the newest record row (`settings.row` has its signals), `law` the control law,
     `backend` the open back end.
-    The setting hal.backend must be simulated or replay. `model`, `parameters` and
-    `backend`: those of the settings if None.
-    """
+    The setting hal.backend must be simulated. `model`, `parameters` and
+    `backend`: those of the settings if None."""
 
     def __init__(
         self,
@@ -61,8 +60,7 @@ class Simulation:
     def command(self, name: str, value: float = 0.0) -> None:
         """Give arm, disarm, or setpoint (um) for the next tick.
 
-        Raises RuntimeError when the mailbox is full.
-        """
+        Raises RuntimeError when the mailbox is full."""
         if not self.mailbox.push(COMMANDS[name], float(value)):
             raise RuntimeError("more commands than the mailbox holds: let it tick")
 
@@ -74,8 +72,7 @@ class Simulation:
     def tick(self, count: int = 1) -> np.ndarray:
         """Run `count` ticks; return the newest row (a view).
 
-        Without `publish` only the last row is made.
-        """
+        Without `publish` only the last row is made."""
         rig, law, period_s = self.rig, self.law, self.period_s
         for left in range(count - 1, -1, -1):
             self.ticks += 1
@@ -85,7 +82,7 @@ class Simulation:
                 law.step(period_s, rig.command, rig.value, rig.external)
                 rig.actuate()
             else:
-                rig.tick(now_s, period_s, 0.0, _no_clock)
+                rig.tick(now_s, period_s, 0.0, lambda: 0)
         return self.row
 
     def until(self, condition: Any, limit_s: float) -> bool:
@@ -109,10 +106,6 @@ class Simulation:
         self.backend.close()
 
 
-def _no_clock() -> int:
-    return 0
-
-
 SETTLE_S = 0.5  # settling time at the setpoint before the deviation counts
 STROKE_UM, CYCLE_S = 200.0, 75.0
 
@@ -121,8 +114,7 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
     """Move in trapezoids of 75 s (the paper's test 4B); print mean and largest deviation of the output.
 
     The reference encoder, which the law never reads, measures it while the reference has stood for SETTLE_S.
-    out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1.
-    """
+    out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1."""
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)
     simulation.arm()

@@ -27,8 +27,7 @@ FEWEST = 10  # no rate is reported where fewer readings are expected in the tick
 def expected_hz(settings: Settings) -> dict[str, float]:
     """Return the profile's rate of each role, Hz; empty for back ends without devices.
 
-    Raises InputError.
-    """
+    Raises InputError."""
     if settings.hal.backend != "devices":
         return {}
     from thermoctl_hal.rig.make import make_devices
@@ -39,8 +38,7 @@ def expected_hz(settings: Settings) -> dict[str, float]:
 def slow(role: str, found_hz: float, expected: Mapping[str, float], reads_hz: float) -> str:
     """Return a sentence when `role` arrives too slowly, else ''.
 
-    reads_hz: how often the reading was checked; a higher rate cannot be seen.
-    """
+    reads_hz: how often the reading was checked; a higher rate cannot be seen."""
     due_hz = min(expected.get(role, 0.0), reads_hz)
     if found_hz >= SLOW_SHARE * due_hz:
         return ""
@@ -73,8 +71,7 @@ def device_counters(shared: Shared) -> dict[str, dict[str, int]]:
 def slow_readings(shared: Shared, expected: Mapping[str, float]) -> list[str]:
     """List a line for each reading that arrived too slowly in the last LOOK_ROWS ticks.
 
-    Only ticks in which the reading was good count: one that is lost is a fault and not listed.
-    """
+    Only ticks in which the reading was good count: one that is lost is a fault and not listed."""
     rows, _, _ = shared.ring.read(max(0, shared.ring.head - LOOK_ROWS))
     if len(rows) < 2:
         return []

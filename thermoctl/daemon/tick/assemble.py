@@ -107,8 +107,7 @@ def lacks(settings: Settings) -> list[str]:
     """Return a line for each sensor that this rig has not, with the consequence.
 
     Empty for back ends without devices. Raises InputError for a model on a rig without any temperature of
-    the air or the coil: there is nothing to start its estimates from.
-    """
+    the air or the coil: there is nothing to start its estimates from."""
     if settings.hal.backend != "devices":
         return []
     folder, coil = Path(settings.path).parent, settings.channels.coil
@@ -148,8 +147,7 @@ def lacks(settings: Settings) -> list[str]:
 def check_mode(settings: Settings) -> None:
     """Check that the drive takes a target position, um, only with control.mode: position.
 
-    Raises InputError.
-    """
+    Raises InputError."""
     folder, wanted = Path(settings.path).parent, settings.control.mode == "position"
     for node in settings.hal.devices if settings.hal.backend == "devices" else ():
         profile = bind(node, folder, settings.channels).profile
@@ -166,8 +164,7 @@ def check_mode(settings: Settings) -> None:
 def compensator(settings: Settings) -> CompensatorModel:
     """Load the model that `compensation.model` names, else a model without rises and expansion.
 
-    Raises InputError for a model of another rig, or of other points.
-    """
+    Raises InputError for a model of another rig, or of other points."""
     if not settings.compensation.model:
         return zero_model(settings.loop.period_s, settings.channels.point_names)
     from thermoctl.identify.modelfile import load_model
@@ -178,8 +175,7 @@ def compensator(settings: Settings) -> CompensatorModel:
 def origin(settings: Settings) -> str:
     """Return a line for a model computed from a plant file; '' for one fitted to recordings.
 
-    Raises InputError for an unreadable model.
-    """
+    Raises InputError for an unreadable model."""
     if not settings.compensation.model:
         return ""
     from thermoctl.identify.modelfile import load_calibration
@@ -214,8 +210,7 @@ def shared_name(settings: Settings) -> str:
 def rig_identity(settings: Settings) -> str:
     """Return the rig's name in recordings.
 
-    It is rig.name, or, without one, the configuration's name and a hash of its path.
-    """
+    It is rig.name, or, without one, the configuration's name and a hash of its path."""
     if settings.rig.name != UNNAMED:
         return settings.rig.name
     path = Path(settings.path).absolute()

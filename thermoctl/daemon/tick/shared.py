@@ -107,8 +107,7 @@ def _layout(row: Row) -> int:
 class Shared:
     """The segment with its areas; the supervisor calls `create`, others `attach`.
 
-    `row`: the signals of its rows; `channels`: the rig's channels.
-    """
+    `row`: the signals of its rows; `channels`: the rig's channels."""
 
     def __init__(self, memory: mmap.mmap, path: Path, channels: Channels):
         self._memory, self._path = memory, path
@@ -194,8 +193,7 @@ class Shared:
     def attach(cls, name: str) -> Shared:
         """Attach to the segment of a running daemon.
 
-        Raises InputError when there is none, it belongs to another user, or it has another layout.
-        """
+        Raises InputError when there is none, it belongs to another user, or it has another layout."""
         path = SHARED_MEMORY / name
         try:
             file = os.open(path, os.O_RDWR)

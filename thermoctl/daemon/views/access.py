@@ -35,8 +35,7 @@ class Policy:
     def check_source(self, headers: Any) -> None:
         """Refuse requests that another web page made the browser send.
 
-        They show a foreign Host (DNS rebinding) or Origin.
-        """
+        They show a foreign Host (DNS rebinding) or Origin."""
         host = headers.get_all("Host") or []
         if len(host) != 1 or not self._ours(_host_name(host[0])):
             raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served; see --name")

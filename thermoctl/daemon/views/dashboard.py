@@ -227,8 +227,7 @@ class Handler(BaseHTTPRequestHandler):
     def _live(self, query: Query) -> None:
         """Send frames until the client disconnects.
 
-        A slow client misses frames; one that stops reading is dropped.
-        """
+        A slow client misses frames; one that stops reading is dropped."""
         if not self.server.streams.acquire(blocking=False):
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"already {MAX_STREAMS} pages are open")
         try:
@@ -458,8 +457,7 @@ def make_server(
 ) -> Server:
     """Make a server on `listen` that does not serve yet.
 
-    listen: ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback.
-    """
+    listen: ADDRESS:PORT, [V6ADDRESS]:PORT, or PORT on loopback."""
     address, port = parse_address(listen)
     if token and len(token) < MIN_TOKEN:
         raise InputError(f"the token has {len(token)} characters; at least {MIN_TOKEN} were expected")

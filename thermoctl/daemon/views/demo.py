@@ -48,8 +48,7 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
     """Start a daemon of its own, arm, move and show it until Ctrl-C or for `seconds`.
 
     Returns 1 when a fault is active at the end, 3 when the daemon did not start. Raises InputError for a
-    rig that is not simulated, and while another demo runs here.
-    """
+    rig that is not simulated, and while another demo runs here."""
     if settings.hal.backend != "simulated":
         raise InputError(
             f"{settings.path}: demo moves a simulated rig only, and this one's back end is '{settings.hal.backend}'; "
@@ -63,7 +62,8 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
         except KeyboardInterrupt:
             return 0
         finally:
-            _ignore_signals()
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
             show.close()
 
 
@@ -75,8 +75,7 @@ def demo_folder(settings: Settings) -> Path:
 def _own(settings: Settings) -> Any:
     """Write the configuration of the demo into its folder: this rig, with files of its own.
 
-    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it.
-    """
+    Its time counts ticks, so that a stalled machine slows the rig down instead of faulting it."""
     folder, beside = demo_folder(settings), Path(settings.path).absolute().parent
     make_folder(folder)
     hal = settings.hal
@@ -116,11 +115,6 @@ def _stopped_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _ignore_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
-
-
 class _Demo:
     """The daemon of `settings` as a child, and what the terminal shows of it."""
 
@@ -142,8 +136,7 @@ class _Demo:
         """Arm, move and show the rig for `seconds`, or until q is pressed; return the exit status.
 
         1: a fault in the last status (warnings do not count), or the child has ended. 3: the child was not
-        READY within START_S. Raises InputError when arming is refused or the child has lost its lock.
-        """
+        READY within START_S. Raises InputError when arming is refused or the child has lost its lock."""
         if not self._ready():
             sys.stderr.write(self.child.said())
             return 3

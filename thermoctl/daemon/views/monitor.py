@@ -10,7 +10,7 @@ import math
 import textwrap
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -23,6 +23,7 @@ from thermoctl.daemon.answers.display import (
     EXPECTED,
     FREE,
     MEASURED,
+    between,
     fault_lines,
     message_lines,
     number,
@@ -57,8 +58,7 @@ def errors(status: dict[str, Any]) -> tuple[float | None, float | None]:
     """Return the output's error with compensation and without it, um; None unless armed.
 
     The reference encoder measures the output; without one the law's estimate is used, which is expected and
-    not measured. Both are None while that encoder is invalid, and with neither encoder nor model.
-    """
+    not measured. Both are None while that encoder is invalid, and with neither encoder nor model."""
     reference, output = status.get("reference_um"), status.get("output_reference_um")
     if status.get("output_is") == EXPECTED:
         output = status.get("compensated_um")
@@ -103,8 +103,7 @@ def screen(
     """Draw one moment from the answers of the command socket, `width` characters wide.
 
     height: lines of the terminal, 0 for any number. The values come before the sparklines, and faults take
-    at most the lines that the values leave, but always FEWEST.
-    """
+    at most the lines that the values leave, but always FEWEST."""
     faults = _faults(status["faults"])
     head = Text.assemble(("thermoctl ", "bold"), (f" {status['state']} ", STYLE.get(status["state"], "bold")))
     if "channels" not in status:
@@ -229,11 +228,7 @@ def _trails(trails: dict[str, deque[float]], width: int, ramp: str) -> Table:
 
 def _timing(latency: dict[str, Any], ramp: str) -> Text:
     late, busy = latency["lateness"], latency["busy"]
-    bins: list[Sequence[float]] = late["bins_us"]
-    edges = (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf)
-    counts = [
-        sum(c for us, c in bins if low <= us < high) for low, high in zip(edges, edges[1:], strict=False)
-    ]
+    counts = between(late["bins_us"], (0, 2, 5, 10, 20, 50, 100, 200, 500, 1000, math.inf))
     shape = sparkline([math.log1p(c) if c else math.nan for c in counts], len(counts), ramp)
     return Text.assemble(
         ("lateness      ", "dim"),
@@ -265,8 +260,7 @@ def look(path: str, with_latency: bool = True) -> tuple[dict[str, Any], dict[str
 def show(settings: Settings, interval_s: float = 0.5, once: bool = False) -> int:
     """Show the rig until Ctrl-C.
 
-    `once`, or no terminal: print one screen and return 1 when no daemon runs or a fault is active.
-    """
+    `once`, or no terminal: print one screen and return 1 when no daemon runs or a fault is active."""
     if not 0.05 <= interval_s <= 60.0:
         raise InputError(f"--interval {interval_s:g}: 0.05 to 60 seconds were expected")
     console = Console()

@@ -30,8 +30,7 @@ class Bridge:
     """Asks the daemon of `settings` and publishes below `topic`.
 
     broker: HOST or HOST:PORT (default 1883, with `tls` 8883); user, password: where the broker asks for
-    them.
-    """
+    them."""
 
     def __init__(
         self,
@@ -112,9 +111,8 @@ class Bridge:
     def close(self) -> None:
         """Publish `offline` and disconnect."""
         if self.connected.is_set():
-            with contextlib.suppress(
-                RuntimeError, ValueError
-            ):  # the connection was just lost: the last will publishes it
+            # The connection was just lost: the last will publishes it.
+            with contextlib.suppress(RuntimeError, ValueError):
                 self.client.publish(
                     f"{self.topic}/availability", OFFLINE, qos=1, retain=True
                 ).wait_for_publish(2.0)

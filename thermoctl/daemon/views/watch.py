@@ -23,7 +23,7 @@ import numpy as np
 
 from thermoctl.configuration.settings import Settings
 from thermoctl.control import arming, faults
-from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN
+from thermoctl.daemon.answers.display import EXPECTED, MEASURED, UNKNOWN, between
 from thermoctl.daemon.answers.readings import finite, hide_invalid, invalid
 from thermoctl.daemon.answers.snapshot import latency, status
 from thermoctl.daemon.tick.assemble import compensator, rig_identity, shared_name
@@ -93,8 +93,7 @@ class Watch:
 
     frame: the newest one, a dict ready for JSON; `wait(seen)` returns (number, frame) as soon as its
     number is not `seen`. captures: newest last. past: the last minute, {state, PAST signals} every tenth
-    of a second, oldest first.
-    """
+    of a second, oldest first."""
 
     def __init__(self, settings: Settings, rate_hz: float = 20.0):
         self.settings, self.rate_hz = settings, rate_hz
@@ -159,11 +158,7 @@ class Watch:
         answer = latency(shared, self.settings.loop.period_s)
         for name in ("lateness", "busy", "reference"):
             bins = answer[name].pop("bins_us")
-            edges = (*LATENESS_EDGES_US, math.inf)
-            answer[name]["counts"] = [
-                sum(c for us, c in bins if low <= us < high)
-                for low, high in zip(edges[:-1], edges[1:], strict=True)
-            ]
+            answer[name]["counts"] = between(bins, (*LATENESS_EDGES_US, math.inf))
         return {**answer, "edges_us": list(LATENESS_EDGES_US)}
 
     def _attached(self) -> Shared | None:
@@ -244,8 +239,7 @@ class Watch:
     def _keep(self, rows: np.ndarray, lost: int) -> None:
         """Add rows to open captures; begin one for each new fault that trips.
 
-        lost: ticks missing before `rows`, because this process fell behind by more than the ring's length.
-        """
+        lost: ticks missing before `rows`, because this process fell behind by more than the ring's length."""
         if lost:
             self._recent.clear()
         for capture in self.captures:

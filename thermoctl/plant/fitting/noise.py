@@ -34,8 +34,7 @@ MIN_SAMPLES = 20  # fewest samples of a channel for an estimate of its noise
 def innovations(phi: float, white: float, total: float) -> Noise:
     """Return AR(1) noise with correlation phi and an uncorrelated part, as Noise.
 
-    `white` is the variance of the uncorrelated part, `total` that of the whole.
-    """
+    `white` is the variance of the uncorrelated part, `total` that of the whole."""
     coloured = max(total - white, 0.02 * total)
     if phi < MIN_CORRELATION:
         return Noise(float(np.sqrt(total)))
@@ -112,8 +111,7 @@ class _Restricted:
     def _score(self, j: int, phi: float) -> tuple[float, Noise]:
         """Return -2 log restricted likelihood of channel j at a correlation phi, and its noise.
 
-        Three iterations determine the standard deviation.
-        """
+        Three iterations determine the standard deviation."""
         output = list(self.found.model.plant.outputs.values())[j]
         white = (output.resolution or 0.0) ** 2 / 12
         residuals = np.concatenate([r[np.isfinite(r[:, j]), j] for r in self.found.residuals])

@@ -77,8 +77,7 @@ class _Limits:
     """Limits of a descent.
 
     `tolerance`: least gain in cost; `deadline`: clock of the thread, s; `goal`: a cost that must stay in
-    reach.
-    """
+    reach."""
 
     iterations: int
     tolerance: float

@@ -80,8 +80,7 @@ class ResidualRows:
     """Whitened residuals of one output in one recording, and their sensitivities, for one refit step.
 
     `w` (M,) residuals; `weight` (M,) Huber's weights; `unknowns` (k,) indices in the refit's z.
-    -dw/dz = `jac` (M, k) * `slope` (k,).
-    """
+    -dw/dz = `jac` (M, k) * `slope` (k,)."""
 
     recording: int
     output: int
@@ -234,8 +233,7 @@ class Problem:
         """Set Huber's limit of each output from its residuals; True if one changed by more than a half.
 
         Residuals of missing physics must not count as outliers, nor anything that affects more than one
-        sample in fifty.
-        """
+        sample in fifty."""
         new = np.full(len(self.noise), HUBER)
         for j in range(len(self.noise)):
             w = np.concatenate([self.whitening[r][j].whiten(e[:, j]) for r, e in enumerate(residuals)])
@@ -385,8 +383,7 @@ class Problem:
         """Return output j's rows from its whitened residuals, their weights and sensitivities (N, k).
 
         White noise of one standard deviation only scales the sensitivities: they are not copied, and a
-        missing sample gets weight 0.
-        """
+        missing sample gets weight 0."""
         own, n = self.whitening[r][j], len(jac)
         if not own.white or len(own.index) < (1 - DOWNDATE_SHARE) * n:
             return ResidualRows(r, j, k, slope, own.whiten(jac), w, weight)
@@ -396,8 +393,7 @@ class Problem:
 def _gram(jac: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the weighted normal matrix J'WJ.
 
-    If few rows are down-weighted, compute J'J and subtract their excess.
-    """
+    If few rows are down-weighted, compute J'J and subtract their excess."""
     lowered = np.flatnonzero(weight != 1.0)
     if len(lowered) > DOWNDATE_SHARE * len(jac):
         jac = jac * np.sqrt(weight)[:, None]

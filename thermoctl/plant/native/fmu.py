@@ -137,7 +137,7 @@ class Fmu:
             int(d.numberOfEventIndicators > 0),
             int(bool(exact)),
         ]
-        scale = [1.0, *(float(getattr(v, "nominal", 0) or 0) or _size(now[v.name]) for v in arguments)]
+        scale = [1.0, *(float(getattr(v, "nominal", 0) or 0) or abs(now[v.name]) or 1.0 for v in arguments)]
         self._handle = self._library.fmu_make(
             self._instance.component,
             (ctypes.c_void_p * len(functions))(*functions),
@@ -209,10 +209,6 @@ def _variable(v: ModelVariable, now: Mapping[str, float]) -> Variable:
     value = now.get(v.name, 0.0)
     unit = v.unit or (v.declaredType.unit if v.declaredType else None)
     return Variable(v.name, unit, value, limits, v.causality == "input" and _discrete(v))
-
-
-def _size(value: float) -> float:
-    return abs(value) or 1.0
 
 
 def opened(path: str) -> Fmu:

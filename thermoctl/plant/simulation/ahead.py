@@ -28,8 +28,7 @@ def ahead(
 
     An extended Kalman filter estimates the states at the start of each block from the data before it. So a
     sample is predicted from data up to `horizon_s` older. The model must have every state uncertain and no
-    active parameter.
-    """
+    active parameter."""
     if not model.states:
         run = model.run(excitation)
         return run.x, run.y, run.x[-1] if len(run.x) else np.zeros(0)

@@ -91,8 +91,7 @@ class _Forces(ctypes.Structure):
 def _buffer(kept: dict[str, np.ndarray] | None, key: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array to fill.
 
-    Touching new memory pages costs more than the arithmetic on them, so a caller may keep the array.
-    """
+    Touching new memory pages costs more than the arithmetic on them, so a caller may keep the array."""
     if kept is None:
         return np.empty(shape)
     size = int(np.prod(shape))
@@ -189,8 +188,7 @@ class Model:
     def _delayed_inputs(self, excitation: Excitation, p: np.ndarray) -> np.ndarray:
         """Return u with the derived columns of delayed inputs.
 
-        They are the mean of the held signal over each interval, delayed, and its derivative by the delay.
-        """
+        They are the mean of the held signal over each interval, delayed, and its derivative by the delay."""
         if not self.code.input_delays:
             return excitation.u
         u = excitation.u.copy()
@@ -439,8 +437,7 @@ class Model:
         """Return the outputs' first-order response (N, ny, columns) to additional forces on dx/dt.
 
         Entry e of `forces` is (state, column); its values, per second, are q[:, e] of q (N, entries).
-        `buffers`: as of `run`; the next response in the same thread overwrites this one.
-        """
+        `buffers`: as of `run`; the next response in the same thread overwrites this one."""
         lib, n, nx = self.code.library, len(excitation.t), len(self.states)
         p = self.vector(parameters, excitation.name)
         if excitation.scale is None or excitation.width is None:
@@ -580,9 +577,8 @@ class Stepper:
         self._want = np.zeros(1)
         self._width = np.full(max(len(m.code.jumps), 1), 1e-6)
         self._atol = self.rtol * (np.abs(self.x) * 1e-2 + 1e-3)
-        self._memory = np.zeros(
-            self._library.memory_size()
-        )  # the matrix of the exponential method, see integrator.h
+        # The matrix of the exponential method, see integrator.h.
+        self._memory = np.zeros(self._library.memory_size())
         tail = (self._atol, self.x, self._y, self._want, self._memory)
         self._pointers = tuple(
             [a.ctypes.data for a in part] for part in ((self._u, self._p, self._width), tail)

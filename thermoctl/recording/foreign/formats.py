@@ -362,8 +362,7 @@ def write_mdf(path: str, table: Table) -> None:
 def write_mcap(path: str, table: Table) -> None:
     """Write MCAP with one JSON message a row on /thermoctl (Foxglove and PlotJuggler plot its fields).
 
-    A missing sample is left out of its message. Log time is `wall_s` if it is recorded, else `t`.
-    """
+    A missing sample is left out of its message. Log time is `wall_s` if it is recorded, else `t`."""
     writer_module = load("mcap.writer", Path(path))
     clock = table.columns.get("wall_s", table.t - min(table.t[0], 0.0))
     unit = {"t": "s"} | units(table.columns)

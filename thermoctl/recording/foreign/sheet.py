@@ -32,9 +32,6 @@ def as_cells(values: np.ndarray) -> Cells:
     )
 
 
-EQUAL_TIMES = ("spread", "mean", "first", "last")
-
-
 @dataclass(frozen=True)
 class How:
     """Choices of a person about the reading of a file; the reader finds the others.
@@ -44,7 +41,7 @@ class How:
     - `missing`: further words and numbers for "no value"
     - `decimal`: the decimal sign
     - `run`: the one to read of several in a file, from 1
-    - `equal_times`: see EQUAL_TIMES
+    - `equal_times`: spread, mean, first or last
     - `trace`: receives how the file was read, for people"""
 
     time: str | None = None

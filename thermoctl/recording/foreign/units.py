@@ -24,9 +24,8 @@ ANGLES = (), dimension("Hz")  # dimensions in which pint takes a radian for 1 an
 _POWER = r"(?:(?:\^|\*\*)?-?\d|[²³⁻¹]+)?"
 _UNIT = re.compile(rf"1$|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}\)?)*$")
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
-_LAST = re.compile(
-    r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$"
-)  # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope
+# `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope.
+_LAST = re.compile(r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
 _SPELLED = {word: unit for unit, words in SPELLINGS.items() for word in words.split(" | ")}
@@ -169,9 +168,8 @@ def named(name: str) -> int:
         return COUNTED
     if re.fullmatch(r"t|ts|t[_ ]?(s|ms|us|ns|min|h|d|sec|msec)", name.strip()):
         return NAMED
-    words = [
-        w for k, w in enumerate(words) if w != "data" or k == 0
-    ]  # Italian for a date, English for values
+    # `data` is a date in Italian, and values in English.
+    words = [w for k, w in enumerate(words) if w != "data" or k == 0]
     if any(w in _TIMES for w in words) or re.match(r"(?i)(date|time|zeit|datum|timestamp)", "".join(words)):
         return NAMED
     if "#" in name or any(w in _COUNTERS for w in words[:1]):

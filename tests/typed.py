@@ -1,6 +1,6 @@
 """Write the generated parts of law.pxd: C types of the law's constants, of the parameters and of its state.
 
-    python -m thermoctl.control.typed [--check]
+    python -m tests.typed [--check]
 
 With --check nothing is written; exit status 1 and one line when the file differs. The names come from law.py
 and from Parameters, so a new limit, constant or state variable is declared once.
@@ -16,9 +16,10 @@ from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 
+from thermoctl.control import model
 from thermoctl.control.model import BY_CHANNEL, Parameters
 
-HERE = Path(__file__).parent
+CONTROL = Path(model.__file__).parent
 _WIDTH = 110
 _INT_BITS = 31
 _PART = re.compile(r"^( *)# generated: (.*)\n(?:.*\n)*?\1# end\n", re.MULTILINE)
@@ -26,7 +27,7 @@ _PART = re.compile(r"^( *)# generated: (.*)\n(?:.*\n)*?\1# end\n", re.MULTILINE)
 
 def interpreted_law() -> ModuleType:
     """Return law.py as an interpreted module: the compiled one hides its constants."""
-    spec = importlib.util.spec_from_file_location("interpreted_law", HERE / "law.py")
+    spec = importlib.util.spec_from_file_location("interpreted_law", CONTROL / "law.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -86,12 +87,12 @@ def declarations(text: str, law: ModuleType) -> str:
 
 def main(arguments: list[str]) -> int:
     """Write law.pxd, or with --check report whether it is up to date."""
-    path = HERE / "law.pxd"
+    path = CONTROL / "law.pxd"
     text = path.read_text(encoding="utf-8")
     made = declarations(text, interpreted_law())
     if "--check" in arguments:
         if made != text:
-            print(f"{path}: not up to date; run `python -m thermoctl.control.typed`, then `make install`")
+            print(f"{path}: not up to date; run `python -m tests.typed`, then `make install`")
         return int(made != text)
     path.write_text(made, encoding="utf-8")
     return 0
