@@ -1,4 +1,4 @@
-"""The project's log: events on stderr, each with time, rig, axis and run.
+"""The project's log: structlog events on stderr, each with time, rig, axis and run.
 
 A terminal and a log file get readable lines, journald gets JSON. Nothing stops when a line cannot be
 written: lost lines are counted, and the next one that can be written says how many. `take_over` makes events
@@ -13,8 +13,10 @@ import os
 import sys
 import threading
 import traceback
-from datetime import UTC, datetime
+from collections.abc import MutableMapping
 from typing import Any
+
+import structlog
 
 _bound: dict[str, Any] = {}
 _LAST = ("rig", "axis", "run")  # fields at a line's end
@@ -23,22 +25,14 @@ _LAST = ("rig", "axis", "run")  # fields at a line's end
 def bind(**fields: Any) -> None:
     """Add fields to all further events of this process and of those that it forks.
 
-    Empty ones are left out."""
+    Empty ones are left out.
+    """
     _bound.update({name: value for name, value in fields.items() if value})
 
 
 def console_log(event: str, **fields: Any) -> None:
     """Log an event; fields that are None are left out."""
-    given = {name: value for name, value in fields.items() if value is not None}
-    last = {**_bound, **given}
-    given = {k: v for k, v in given.items() if k not in _LAST} | {k: last[k] for k in _LAST if k in last}
-    stamp = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
-    if _to_journal():
-        _stderr.write(json.dumps({"time": stamp, "event": event, **given}, default=str))
-    else:
-        _stderr.write(
-            " ".join([f"{stamp} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in given.items())])
-        )
+    _logger.info(event, **fields)
 
 
 def failed(what: str, error: BaseException) -> None:
@@ -65,6 +59,12 @@ def take_over() -> None:
     )
 
 
+def _add_bound(_: Any, __: str, fields: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    given = {name: value for name, value in fields.items() if value is not None}
+    last = {**_bound, **given}
+    return {k: v for k, v in given.items() if k not in _LAST} | {k: last[k] for k in _LAST if k in last}
+
+
 def _to_journal() -> bool:
     """Return whether systemd connected stderr with journald (JOURNAL_STREAM of systemd.exec(5))."""
     try:
@@ -72,6 +72,13 @@ def _to_journal() -> bool:
     except OSError:
         return False
     return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+def _render(_: Any, __: str, fields: MutableMapping[str, Any]) -> str:
+    time_, event = fields.pop("time"), fields.pop("event")
+    if _to_journal():
+        return json.dumps({"time": time_, "event": event, **fields}, default=str)
+    return " ".join([f"{time_} thermoctl: {event}", *(f"{k}={_text(v)}" for k, v in fields.items())])
 
 
 def _text(value: Any) -> str:
@@ -85,7 +92,7 @@ class _Stderr:
     lost = 0
     torn = False
 
-    def write(self, line: str) -> None:
+    def info(self, line: str) -> None:
         """Write one line."""
         head = "\n" if self.torn else ""
         if self.lost:
@@ -103,4 +110,8 @@ class _Stderr:
             self.lost += 1
 
 
-_stderr = _Stderr()
+_logger = structlog.wrap_logger(
+    _Stderr(),
+    processors=[_add_bound, structlog.processors.TimeStamper(fmt="iso", utc=True, key="time"), _render],
+    wrapper_class=structlog.BoundLogger,
+)

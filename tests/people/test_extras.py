@@ -82,7 +82,7 @@ from thermoctl.extras import EXTRAS, lacking
 for packages in EXTRAS.values():
     for module in packages:
         sys.modules[module] = None
-import numpy, scipy.stats, pyarrow, pint, rich.table, yaml, shtab, crccheck.crc
+import numpy, scipy.stats, pyarrow, pint, rich.table, yaml, structlog, shtab, crccheck.crc
 functions = {c.function for c in COMMANDS}
 bad = 0
 for extra in ["no extra", *EXTRAS]:
