@@ -256,6 +256,7 @@ CASES = (
          "SampleTime[ms]\t500\tSampleTime[ms]\t500\nUnit\t°C\tUnit\tW\n", "{k}\t{T}.0\t{k}\t{P}.0"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),
     Case("InfluxDB, annotated CSV", "influx.csv", rows("#group,false,false,false,true,false\n#datatype,string,long,dateTime:RFC3339,string,double\n#default,_result,,,,\n"
          ",result,table,_time,_field,_value\n", ",,0," + DATE + "T10:00:{s}Z,T,{T}") + rows("", ",,1," + DATE + "T10:00:{s}Z,P,{P}"), {"T": RISING, "P": POWER}),
+    Case("InfluxDB, line protocol", "points.txt", rows("", "rig,place=block T={T}.5,P={P}i 177235920{i}000000000"), {"T": [x + 0.5 for x in RISING], "P": POWER}),
     Case("Home Assistant, history CSV", "history.csv", "entity_id,state,last_changed\n" + "".join(
         f"{e},{s},{_ISO.format(t)}\n" for (e, s), t in zip(_HA, _HA_TIMES, strict=True)),
         {"sensor.block": [20, np.nan, 22, np.nan], "switch.heater": [0, np.nan, np.nan, 1]}, [0, 1, 2, 3]),
@@ -273,7 +274,11 @@ CASES = (
          {"T": RISING}),
     Case("Klipper, klippy.log", "klippy.log", rows("Start printer\n", _KLIPPER), {"heater_bed_temp": RISING, "heater_bed_pwm": [p / 10 for p in POWER]},
          units={"heater_bed_temp": "degC"}),
+    Case("Moonraker, temperature store", "store.json", json.dumps({"result": {"extruder": {"temperatures": RISING, "targets": [0] * 6, "powers": POWER}}}),
+         {"extruder_temperature": RISING, "extruder_power": POWER}, units={"extruder_temperature": "degC"}),
     Case("ThingSpeak, CSV", "feeds.csv", rows("created_at,entry_id,field1,field2\n", DATE + " 10:00:{s} UTC,{i},{T},{P}"), {"field1": RISING, "field2": POWER}),
+    Case("ThingSpeak, JSON", "feeds.json", json.dumps({"channel": {"field1": "T"}, "feeds": [{"created_at": _ISO.format(i), "entry_id": i, "field1": str(20 + i)} for i in range(6)]}),
+         {"T": RISING}),
     Case("Excel with a cover sheet", "cover.xlsx", _excel, {"T": RISING, "P": POWER}, units={"T": "degC"}),
     Case("Parquet with columns of every type", "mixed.parquet", _parquet, {"T": RISING, "P": POWER}),
     Case("Arduino Serial Plotter, milliseconds", "arduino.txt", rows("millis\tT\tP\n", "{k}\t{T}.0\t{P}"), {"T": RISING, "P": POWER}, [0, 0.5, 1, 1.5, 2, 2.5]),

@@ -24,6 +24,9 @@ from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled, st
 IDS = WORDS["identities"].split()
 VALUES = WORDS["values"].split()
 _BOOKKEEPING = {"result", "table", "_start", "_stop", "_measurement"}
+_POINT = re.compile(
+    r"^(?P<head>(?:\\.|[^\s\\])+) (?P<fields>(?:\\.|\"(?:\\.|[^\"\\])*\"|[^\s\\\"])+)(?: (?P<time>-?\d+))?$"
+)
 _STATS = re.compile(r"^(?:[^\n]*?[ \t])?Stats (\d+\.\d+): (.*)$", re.MULTILINE)
 _LABEL = r"([A-Za-z_]\w*):\s?([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
 _LABELS = re.compile(
@@ -44,9 +47,11 @@ def special(path: Path, text: bytes) -> list[Sheet] | None:
     return None
 
 
-def _sheet(columns: Mapping[str, Sequence[Any]], place: Callable[[int], str]) -> Sheet:
+def _sheet(
+    path: Path, columns: Mapping[str, Sequence[Any]], place: Callable[[int], str], name: str = ""
+) -> Sheet:
     texts = {n: pa.array(["" if v is None else _word(v) for v in c], pa.string()) for n, c in columns.items()}
-    return Sheet(dict(texts), place)
+    return Sheet(dict(texts), place, name=name)
 
 
 def _word(value: Any) -> str:
@@ -57,7 +62,7 @@ def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
     records = [_flat(r) for r in records]
     names = list(dict.fromkeys(k for r in records for k in r))
     columns = {n: [r.get(n) for r in records] for n in names}
-    return _sheet(columns, place_in(path, "record"))
+    return _sheet(path, columns, place_in(path, "record"))
 
 
 def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,8 +119,9 @@ def _of_json(path: Path, content: Any) -> list[Sheet] | None:
         return _of_list(path, content)
     if not isinstance(content, dict):
         return None
-    if sheets := _series(path, content):
-        return sheets
+    for reader in (_thingspeak, _series, _temperature_store):
+        if sheets := reader(path, content):
+            return sheets
     if sheet := _lists(path, content):
         return [sheet]
     inner = [f for v in content.values() if isinstance(v, dict | list) and (f := _of_json(path, v))]
@@ -133,7 +139,7 @@ def _lists(path: Path, content: Mapping[str, Any]) -> Sheet | None:
     rows = max((n for n in lengths if lengths.count(n) > 1), default=0)
     if not rows:
         return None
-    sheet = _sheet({k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
+    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
     sheet.notes += [
         f"list '{k}' left out: {len(v)} items; the others have {rows}"
         for k, v in lists.items()
@@ -164,8 +170,22 @@ def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
         names = content[0] if rows is not content else [f"column_{i + 1}" for i in range(len(rows[0]))]
         plain = not any(isinstance(y, dict | list) for x in rows for y in x)
         if plain and {len(x) for x in rows} == {len(set(names))} != {1}:
-            return [_sheet(dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))]
+            return [
+                _sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))
+            ]
     return None
+
+
+def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    feeds, titles = content.get("feeds"), content.get("channel", {})
+    if not isinstance(feeds, list) or not feeds or not isinstance(titles, dict):
+        return None
+    return [
+        _records(
+            path,
+            [{str(titles.get(k, k)) if k.startswith("field") else k: v for k, v in f.items()} for f in feeds],
+        )
+    ]
 
 
 def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
@@ -183,6 +203,23 @@ def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
 
 def _identity(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in record.items() if k in IDS}
+
+
+def _temperature_store(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    """Read Moonraker's temperature store: a list a second for each heater and sensor, the newest last."""
+    columns: dict[str, list[Any]] = {}
+    for name, held in content.items():
+        if isinstance(held, dict) and isinstance(held.get("temperatures"), list):
+            for key, unit in (("temperatures", "temperature"), ("targets", "target"), ("powers", "power")):
+                if isinstance(held.get(key), list):
+                    columns[f"{name}_{unit}"] = held[key]
+    if not columns:
+        return None
+    rows = min(len(c) for c in columns.values())
+    sheet = _sheet(path, {n: c[len(c) - rows :] for n, c in columns.items()}, place_in(path, "item"))
+    sheet.units = {n: "degC" for n in columns if not n.endswith("_power")}
+    sheet.step_s = 1.0
+    return [sheet]
 
 
 def _annotated(path: Path, text: str) -> list[Sheet] | None:
@@ -206,6 +243,41 @@ def _annotated(path: Path, text: str) -> list[Sheet] | None:
     sheet = _records(path, records)
     sheet.place = lambda row: f"{path}:{places[min(row, len(places) - 1)]}"
     return [sheet]
+
+
+def _points(path: Path, text: str) -> list[Sheet] | None:
+    """Read InfluxDB's line protocol: `measurement,tag=a field=1.0,other=2i 1772359200000000000`."""
+    rows = [(n, x) for n, x in enumerate(text.splitlines(), 1) if x.strip() and not x.startswith("#")]
+    if not rows or not (match := _POINT.match(rows[0][1])) or "=" not in match["fields"] or not match["time"]:
+        return None
+    by_measurement: dict[str, dict[str, list[Any]]] = {}
+    places: dict[str, list[int]] = {}
+    series: set[str] = set()
+    parsed = []
+    for number, line in rows:
+        match = _POINT.match(line.strip())
+        fields = re.findall(r'((?:\\.|[^,=\\])+)=("(?:\\.|[^"\\])*"|[^,]*)', match["fields"]) if match else []
+        if not match or not fields or match["time"] is None:
+            raise InputError(f"{path}:{number}: '{line[:40]}': a point `name field=value time` was expected")
+        parsed.append((number, match["head"], fields, match["time"]))
+        series.add(match["head"])
+    for number, head, fields, time in parsed:
+        table = by_measurement.setdefault(head, {"time": []})
+        places.setdefault(head, []).append(number)
+        count = len(table["time"])
+        table["time"].append(time)
+        for key, value in fields:
+            value = value[:-1] if re.fullmatch(r"-?\d+[iu]", value) else value.strip('"')
+            table.setdefault(key.replace("\\", ""), [None] * count).append(value)
+        for column in table.values():
+            column.extend([None] * (count + 1 - len(column)))
+    sheets = []
+    for head, table in by_measurement.items():
+        tags = "_".join(part.partition("=")[2] for part in head.split(",")[1:]) or head
+        named = {k if k == "time" or len(series) == 1 else f"{tags}_{k}": v for k, v in table.items()}
+        numbers = places[head]
+        sheets.append(_sheet(path, named, lambda row, numbers=numbers: f"{path}:{numbers[row]}"))  # type: ignore[misc]
+    return sheets
 
 
 def _klipper(path: Path, text: str) -> list[Sheet] | None:
@@ -250,7 +322,7 @@ def _tektronix(path: Path, text: str) -> list[Sheet] | None:
     facts = {r[0].lower(): r[1] for r in rows if r[0]}
     name = facts.get("source", "CH1") or "CH1"
     sheet = _sheet(
-        {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
+        path, {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
     )
     units = {"TIME": spelled(facts.get("horizontal units", "s")), name: spelled(facts.get("vertical units"))}
     sheet.units = {k: v for k, v in units.items() if v}
@@ -260,6 +332,7 @@ def _tektronix(path: Path, text: str) -> list[Sheet] | None:
 _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]], ...] = (
     (re.compile(r"\A\s*[{\[]"), _json),
     (re.compile(r"\A(?:#(?:datatype|group|default)\b|,result,table\b)"), _annotated),
+    (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
     (re.compile(r"\A\W?\w?Record Length\"?,"), _tektronix),
     (re.compile(rf"\A{_LABELS.pattern}\s*$", re.MULTILINE), _labelled),

@@ -29,7 +29,7 @@ from thermoctl.recording.foreign.cells import has_no_readings, suspected_codes
 from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
 from thermoctl.recording.foreign.sheet import How
-from thermoctl.recording.foreign.timing import MIXED, seconds_apart, table_of
+from thermoctl.recording.foreign.timing import MIXED, table_of
 from thermoctl.recording.foreign.units import column_of, split_unit, tokens
 from thermoctl.recording.table import Table
 
@@ -175,7 +175,8 @@ def joined(parts: Sequence[Table]) -> Table:
     if len({str(s).endswith("Z") for s in starts if s}) > 1:
         raise InputError(f"{parts[1].path}: {MIXED}")
     if len(parts) > 1 and all(starts):
-        offsets = seconds_apart(starts)
+        since = [np.datetime64(str(s).removesuffix("Z")) for s in starts]
+        offsets = [float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since]
         parts = [replace(p, t=p.t + o) for p, o in zip(parts, offsets, strict=True)]
         first = parts[int(np.argmin(offsets))]
     parts = sorted(parts, key=lambda p: p.t[0])

@@ -413,12 +413,6 @@ def _distinct(
     return t[pick], {n: v[pick] for n, v in values.items()}
 
 
-def seconds_apart(starts: Sequence[str | None]) -> list[float]:
-    """Return the seconds from the earliest of some dates to each of them."""
-    since = [np.datetime64(str(s).removesuffix("Z"), "us") for s in starts]
-    return [float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since]
-
-
 def _united(path: Path, parts: Sequence[Table]) -> Table:
     """Merge tables of different clocks: rows at the union of all times, empty where a column has none."""
     starts = [p.meta.get("start") for p in parts]
@@ -427,7 +421,8 @@ def _united(path: Path, parts: Sequence[Table]) -> Table:
     if len({s.endswith("Z") for s in starts if s}) > 1:
         raise InputError(f"{path}: {MIXED}")
     if all(starts):
-        offsets = np.array(seconds_apart(starts))
+        since = [np.datetime64(str(s).removesuffix("Z"), "us") for s in starts]
+        offsets = np.array([float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since])
     times = [p.t + o for p, o in zip(parts, offsets, strict=True)]
     every = np.sort(np.concatenate(times))
     steps = [float(np.median(np.diff(t))) for t in times if len(t) > 1]
