@@ -377,12 +377,13 @@ FREE = {  # header, options, values over time, and the parameters that made them
         lambda t: (21 + 9 * np.exp(-t / 9), 21 + 0 * t),
         {"G_body_T": 1 / 9},
     ),
+    "emptying": ("h [cm]", "h [cm]", lambda t: 100 * (0.7 - 0.01 * t) ** 2, {"outlet_tank_h": 0.02}),
     "beside": ("x [mm],rh [%]", "x", lambda t: (1e3 * swing(t), 50 + t), {"stiffness": 40, "damping": 0.3}),
 }
 
 
 @pytest.mark.parametrize("kind", FREE)
-def test_a_free_motion_and_a_cooling_need_no_input(folder, kind, capsys):
+def test_a_free_motion_a_cooling_and_an_emptying_need_no_input(folder, kind, capsys):
     header, outputs, course, truth = FREE[kind]
     t = np.arange(0.0, 40.0, 0.02)
     columns = np.atleast_2d(course(t))
@@ -405,12 +406,16 @@ def test_a_free_motion_and_a_cooling_need_no_input(folder, kind, capsys):
     assert {n: refitted[n].value for n in truth} == pytest.approx(truth, rel=0.01)
 
 
-def test_levels_alone_get_the_template_of_a_tank(folder, capsys):
-    rows = "\n".join(f"{t},{8 + t % 2},{5 + 0.1 * t:.1f}" for t in range(60))
+def test_levels_and_a_pump_become_tanks(folder):
+    t, h, area, outlet = np.arange(0.0, 600.0, 1.0), [0.05], 0.02, 2e-4
+    pump = np.where((t // 100).astype(int) % 2 == 0, 8e-5, 3e-5)
+    for q in pump[:-1]:
+        h.append(h[-1] + (q - outlet * h[-1] ** 0.5) / area)
+    rows = "\n".join(f"{a:g},{6e4 * b:.4f},{100 * c:.4f}" for a, b, c in zip(t, pump, h, strict=True))
     (folder / "a.csv").write_text(f"t,Zufluss [l/min],Füllstand [cm]\n{rows}\n", encoding="utf-8")
-    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 2
-    assert "--template NAME" in (said := capsys.readouterr().err) and "tank" in said
-    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv", "--template", "tank"]) == 0
+    assert cli.main(["plant", "new", "p.yaml", "--from-csv", "a.csv"]) == 0
+    values = {n.split("_")[0]: p.value for n, p in load("p.yaml").parameters.items()}
+    assert values == {"area": pytest.approx(area, rel=0.05), "outlet": pytest.approx(outlet, rel=0.05)}
 
 
 def test_names_say_what_heats_what(folder):

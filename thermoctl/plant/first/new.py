@@ -13,7 +13,7 @@ import numpy as np
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.plant.files import loads
-from thermoctl.plant.first import motion, template, thermal
+from thermoctl.plant.first import motion, tanks, template, thermal
 from thermoctl.plant.first.columns import COLDEST, HOTTEST, Column, quoted, recognise
 from thermoctl.plant.first.template import TEMPLATES
 from thermoctl.recording.foreign.logger import options, print_notes, read_recording
@@ -23,6 +23,7 @@ from thermoctl.units import dimension
 
 HEATING = ("power", "current", "voltage", "duty")
 DRIVING = ("force", "torque", "current", "voltage", "duty", "power")
+PUMPING = ("flow", "duty", "power", "voltage")
 
 
 def new(args: argparse.Namespace) -> int:
@@ -76,7 +77,7 @@ def draft(
     inputs: Mapping[str, str] | None = None,
     outputs: Mapping[str, str] | None = None,
 ) -> str:
-    """Return the text of a first plant file: of an axis or of a thermal rig, by the columns' kinds.
+    """Return the text of a first plant file: of an axis, of tanks or of a thermal rig, by the columns' kinds.
 
     `inputs`, `outputs`: columns that the user named, with their units where he stated them; by default the
     kinds decide. Raises InputError where nothing tells what a named column is, or none can be an output."""
@@ -88,9 +89,14 @@ def draft(
         air, sensors = _air(columns, sensors, inputs, outputs)
         drives = _inputs(table, columns, inputs, (*HEATING, "temperature"), sensors, "heats")
         lines = thermal.draft(table, [c for c in drives if c.kind != "temperature"], air, sensors)
-    else:
+    elif kinds & {"position", "angle", "velocity", "turning"}:
+        sensors = [c for c in sensors if c.kind in ("position", "angle", "velocity", "turning")]
         drives = _one_drive(table, _inputs(table, columns, inputs, DRIVING, sensors, "moves"), inputs)
         lines = motion.draft(table, drives, sensors)
+    else:
+        sensors = [c for c in sensors if c.kind == "level"]
+        drives = _inputs(table, columns, inputs, PUMPING, sensors, "fills")
+        lines = tanks.draft(table, drives, sensors)
     text = "\n".join(lines)
     head = f"format: thermoctl-plant/1\ntitle: {quoted(f'First plant of {table.name}')}\n"
     used = {
@@ -150,7 +156,7 @@ def _outputs(
     inputs: Mapping[str, str] | None,
 ) -> list[Column]:
     """Return the columns that may be outputs, by `named`, else by kind. Raises InputError for none."""
-    kinds = ("temperature", "position", "angle", "velocity", "turning")
+    kinds = ("temperature", "position", "angle", "velocity", "turning", "level")
     if named is None:
         outputs = [c for c in columns.values() if c.kind in kinds and c.name not in (inputs or ())]
         if outputs:
@@ -178,7 +184,7 @@ def _no_output(table: Table, columns: Sequence[Column]) -> InputError:
     bare = next((c.name for c in columns if c.name not in empty and (not c.unit or c.doubt)), None)
     unit = f"write its unit, as [degC] or [m]: --outputs '{bare} [UNIT]'; or " if bare else ""
     return InputError(
-        f"{table.path}: a first plant is drawn from a temperature, position or velocity, and none is known in "
+        f"{table.path}: a first plant is drawn from a temperature, position, velocity or level, and none is known in "
         f"{shown}; {unit}take a template that is near, and edit it: thermoctl plant new FILE --template NAME "
         f"({', '.join(TEMPLATES)})"
     )
