@@ -261,12 +261,14 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
     first = ends.get("onset", ends.get("start"))
     equation = _equation(plant, e)
     figures = ", ".join(f"{n} = {p.value:.4g} {p.unit or ''}".strip() for n, p in values.items())
-    family = d.of_family.get(e.key)
+    family, begins = d.of_family.get(e.key), e.candidate.begins
+    own = next((r for r, v in begins.items() if v == 0.0), None)
     return {
         "effect": e.key[0],
         "where": e.key[1],
         "when": None if first is None else [[first, min(ends.get("end", last), last)]],
-        **_recording(e),
+        "recording": own,
+        "lasts": max(begins.values()) > 0 if own else None,
         "probability": round(d.posterior.effects.get(e.key, 0.0), 4),
         "confirmed": round(d.asked.get(e.key, 1.0), 4),
         "equation": equation,
@@ -276,13 +278,6 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
         **(_of_family(d, family) if family else {}),
     }
-
-
-def _recording(e: Placed) -> dict[str, Any]:
-    """Return the one recording in which an event happens, if so, and whether it lasts in later ones."""
-    begins = e.candidate.begins
-    own = next((r for r, v in begins.items() if v == 0.0), None)
-    return {"recording": own, "lasts": max(begins.values()) > 0} if own else {}
 
 
 def _expression(d: Diagnosis, key: Key) -> dict[str, str]:
