@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.evidence.onsets import ONSETS
-from thermoctl.diagnosis.hypothesis.candidates import Candidate
+from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, score
 from thermoctl.diagnosis.search.metric import Metric, Pushed
@@ -122,8 +122,7 @@ def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
 
     A refit cannot move them: a jump has no derivative by its time. Each grid is four times finer than the
     one before."""
-    kinds = direction.candidate.effect.shapes.values()
-    if "onsets" not in kinds and "windows" not in kinds:
+    if EVENTS.isdisjoint(direction.candidate.effect.shapes.values()):
         return direction
     step = rig.duration / ONSETS * (COARSER if direction.candidate.begins else 1)
     while step > 0.5 * rig.sample:

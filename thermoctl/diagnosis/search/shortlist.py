@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
-from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key
+from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate, Key
 from thermoctl.diagnosis.hypothesis.places import PLACES
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
@@ -18,7 +18,6 @@ from thermoctl.diagnosis.search.screening import Screened
 from thermoctl.plant import expression as ex
 
 PAIR = 2
-EVENTS = ("onsets", "windows")  # shapes that happen at one moment
 HALF = 2.0  # largest gain of a refit that is reckoned with, over its first-order promise
 ALIKE = 0.999  # limit of the cosine between two directions, so that their pair can be computed
 
@@ -130,7 +129,7 @@ def largest(looked: Screened) -> list[Direction]:
 
 def _constant(c: Candidate) -> bool:
     """Return whether an entry is physics that does not happen at one moment, and new to the plant."""
-    return not any(kind in EVENTS for kind in c.effect.shapes.values()) and not relabels(c)
+    return EVENTS.isdisjoint(c.effect.shapes.values()) and not relabels(c)
 
 
 def pairs(
