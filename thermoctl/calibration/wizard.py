@@ -81,7 +81,7 @@ class Wizard:
         self.done: dict[str, steps.Result] = {}
         self.at_s: dict[str, float] = {}  # time reached by an interrupted test
         # Wall and rig seconds of tests in this run, for the time left.
-        self._used_s, self._tested_s = (0.0, 0.0)
+        self._used_s, self._tested_s = 0.0, 0.0
         for name in TESTS:
             if name not in tests:
                 raise InputError(f"{self.experiments}: no experiment '{name}'; a calibration needs it")

@@ -17,9 +17,9 @@ from thermoctl.files.yamlfile import InputError
 FALLBACKS = ("config/simulated.yaml", "/etc/thermoctl/rig.yaml")
 
 
-_OFFLINE = ("run", "demo", "start", "stop", "restart", "virtual-rig", "service")
-_BESIDE = ("arm", "disarm", "setpoint", "reload", "dashboard", "tune", "experiment", "calibrate", "diagnose")
-ACTING = frozenset((*_OFFLINE, *_BESIDE))
+_START_OR_STOP = ("run", "demo", "start", "stop", "restart", "virtual-rig", "service")
+_COMMAND = ("arm", "disarm", "setpoint", "reload", "dashboard", "tune", "experiment", "calibrate", "diagnose")
+ACTING = frozenset((*_START_OR_STOP, *_COMMAND))
 """Commands that can move, arm, disarm or stop a rig: each prints the file that it chose by itself.
 
 docs/reference/commands-that-act.md describes them."""

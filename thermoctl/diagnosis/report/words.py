@@ -23,7 +23,7 @@ WORSE = (
 )
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
-LIKELY = 0.05  # least probability of an effect that is mentioned with the verdict `consistent`
+LIKELY = 0.05  # least probability that something is missing, or an effect, that is worth a word
 # Least held-out error, extended over refitted, that speaks against the extended plant. Of 306 outputs of 100
 # diagnoses with findings the largest was 1.07.
 CLEARLY = 1.5
