@@ -37,8 +37,10 @@ class FoundEffect:
     """One effect that the plant lacks.
 
     `confirmed`: probability that it predicts data that it was not fitted to. `parameters`: value, sd and
-    unit by name; `when`: intervals. `members`: of a family whose effects the data do not tell apart, each
-    with effect, where and probability. Equation and parameters are then of the one in the plant."""
+    unit by name; `when`: intervals. `recording`: the one in which an event happens, None where it is at the
+    same time of each; `lasts`: in later recordings, too? `members`: of a family whose effects the data do not
+    tell apart, each with effect, where and probability. Equation and parameters are then of the one in the
+    plant."""
 
     effect: str
     where: str
@@ -48,6 +50,8 @@ class FoundEffect:
     parameters: Mapping[str, Mapping[str, Any]]
     summary: str
     when: Sequence[Sequence[float]] | None = None
+    recording: str | None = None
+    lasts: bool | None = None
     members: Sequence[Mapping[str, Any]] = ()
 
 
