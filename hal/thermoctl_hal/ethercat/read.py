@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
-from thermoctl_hal.base.cia402 import OBJECT_TYPES, STANDARD_TYPES, START_UP, read_object_name
+from thermoctl_hal.base.cia402 import STANDARD_TYPES, read_object_name, read_objects, read_start_up
 from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     FIELD_TYPES,
@@ -49,6 +49,11 @@ class Ethercat(BusSpec):
         """Return the position."""
         return self.position
 
+    def place_of(self, item: Object) -> Place:
+        """Return the place of an object of `transmit`."""
+        before = list(self.transmit.values())[: list(self.transmit).index(item)]
+        return Place(struct.calcsize("<" + "".join(before)), self.transmit[item])
+
 
 @dataclass(frozen=True)
 class Place:
@@ -84,11 +89,7 @@ def read_ethercat(top: Section, _folder: Path) -> Ethercat:
     """Read `ethercat`, the description of a slave. Raises InputError."""
     s = top.section("ethercat")
     k = take(s, ETHERCAT["ethercat"])
-    types: dict[Object, str] = {Object(index): t for index, t in STANDARD_TYPES.items()}
-    if k["objects"] is not None:
-        for name, node in k["objects"].node.value.items():
-            item = read_object_name(Node(name, node.file, node.line, node.column), "objects")
-            types[item] = k["objects"].text(name, choices=OBJECT_TYPES)
+    types = STANDARD_TYPES | read_objects(k["objects"])
     transmit = {}
     for node in k["transmit"] or ():
         item = read_object_name(node, "transmit")
@@ -139,16 +140,13 @@ def _letter(types: Mapping[Object, str], item: Object, node: Node, key: str) -> 
 
 
 def _start_up(node: Node, types: Mapping[Object, str]) -> tuple[Object, str, int]:
-    w = Section(node, "start_up")
-    v = take(w, START_UP)
-    w.end()
-    item = Object(v["index"], v["sub"])
+    item, value = read_start_up(node)
     letter = _letter(types, item, node, "start_up")
     try:
-        struct.pack("<" + letter, v["value"])
+        struct.pack("<" + letter, value)
     except struct.error:
-        raise node.error(f"start_up: {v['value']} does not fit object {object_name(item)}") from None
-    return item, letter, v["value"]
+        raise node.error(f"start_up: {value} does not fit object {object_name(item)}") from None
+    return item, letter, value
 
 
 def read_place(s: Section, spec: BusSpec) -> Place:
@@ -192,11 +190,9 @@ def _place(s: Section, k: dict[str, Any], spec: Ethercat) -> Place:
                 f"byte: {place.end - 1} of the inputs is outside the {spec.input_bytes} input_bytes"
             )
         return place
-    item, offset = read_object_name(k["object"], "object"), 0
-    for sent, letter in spec.transmit.items():
-        if sent == item:
-            return Place(offset, letter)
-        offset += struct.calcsize("<" + letter)
-    raise k["object"].error(
-        f"object: {object_name(item)} is not sent by the slave; add it to 'transmit', or give its 'byte'"
-    )
+    item = read_object_name(k["object"], "object")
+    if item not in spec.transmit:
+        raise k["object"].error(
+            f"object: {object_name(item)} is not sent by the slave; add it to 'transmit', or give its 'byte'"
+        )
+    return spec.place_of(item)
