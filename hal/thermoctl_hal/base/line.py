@@ -74,7 +74,10 @@ def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
 
     Raises HardwareError with the remedy."""
     if path.startswith(NETWORK):
-        return _open_socket(path)
+        match = re.fullmatch(r"socket://(\[[^]]+\]|[^:/]+):(\d+)/?", path)
+        if match is None:
+            raise HardwareError(f"port '{path}': socket://host:port was expected")
+        return connected(path, match[1], match[2], CONNECT_S)
     try:
         port = serial.Serial(
             path,
@@ -111,15 +114,13 @@ def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
     return port
 
 
-def _open_socket(path: str) -> socket.socket:
-    match = re.fullmatch(r"socket://(\[[^]]+\]|[^:/]+):(\d+)/?", path)
-    if match is None:
-        raise HardwareError(f"port '{path}': socket://host:port was expected")
+def connected(where: str, host: str, number: str, timeout_s: float) -> socket.socket:
+    """Connect to a port of a host, non-blocking. Raises HardwareError, which names `where`."""
     try:
-        port = socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECT_S)
+        port = socket.create_connection((host.strip("[]"), int(number)), timeout_s)
         port.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         port.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         port.setblocking(False)
     except (OSError, OverflowError) as e:
-        raise HardwareError(f"{path}: {e}: check power, network and address") from None
+        raise HardwareError(f"{where}: nobody answers ({e}): check power, network and address") from None
     return port

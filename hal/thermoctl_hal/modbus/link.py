@@ -21,7 +21,6 @@ from __future__ import annotations
 import os
 import re
 import select
-import socket
 import struct
 import threading
 import time
@@ -30,7 +29,7 @@ from typing import Any
 
 from thermoctl.extras import load
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.base.line import NETWORK, open_port
+from thermoctl_hal.base.line import NETWORK, connected, open_port
 from thermoctl_hal.base.profile import LineSettings
 from thermoctl_hal.base.wire import checksum
 
@@ -127,19 +126,10 @@ class Link:
 
     def _open(self, timeout_s: float) -> None:
         """Open the port. Raises HardwareError."""
-        self._line: socket.socket | _Serial
         if self._network is None:
-            self._line = _Serial(open_port(self.port[4:], self.line))
+            self._line = open_port(self.port[4:], self.line)
         else:
-            host = self._network[2].strip("[]"), int(self._network[3])
-            try:
-                self._line = socket.create_connection(host, max(timeout_s, 1.0))
-                self._line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._line.setblocking(False)
-            except (OSError, OverflowError) as e:
-                raise HardwareError(
-                    f"{self.port}: nobody answers ({e}): check power, network and address"
-                ) from None
+            self._line = connected(self.port, self._network[2], self._network[3], max(timeout_s, 1.0))
         self._free_s = time.monotonic()
 
     def close(self) -> None:
@@ -344,21 +334,6 @@ class Link:
 
 def _pdu(message: Any) -> bytes:
     return bytes((message.function_code,)) + message.encode()
-
-
-class _Serial:
-    """A serial port as a line: its descriptor, and the handle that closes it."""
-
-    def __init__(self, handle: object) -> None:
-        self._handle = handle
-
-    def fileno(self) -> int:
-        """Return the descriptor."""
-        return int(self._handle.fileno())  # type: ignore[attr-defined]
-
-    def close(self) -> None:
-        """Close the port."""
-        self._handle.close()  # type: ignore[attr-defined]
 
 
 def _rtu_size(data: bytes, request: _Request) -> int:

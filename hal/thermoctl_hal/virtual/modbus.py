@@ -9,6 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from thermoctl_hal.base.message import clipped
 from thermoctl_hal.base.profile import REGISTER_TYPES, Register
 from thermoctl_hal.base.wire import checksum
 
@@ -17,12 +18,8 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
 
 def encode(value: float, register: Register) -> list[int]:
     """Return the words of a raw number; whole types are rounded and clipped to their range."""
-    letter = REGISTER_TYPES[register.type]
-    if letter not in "fd":
-        bits = 8 * struct.calcsize(letter)
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if letter.islower() else (0, (1 << bits) - 1)
-        value = min(max(round(value), low), high)
-    packed = struct.pack(">" + letter, value)
+    letter, value = REGISTER_TYPES[register.type], clipped(value, register)
+    packed = struct.pack(">" + letter, value if letter in "fd" else int(value))
     words = list(struct.unpack(f">{len(packed) // 2}H", packed))
     return words if register.word_order == "big" else words[::-1]
 
