@@ -20,7 +20,7 @@ import pyarrow.parquet
 
 from thermoctl.files.safe_file import whole_file
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.stream import open_stream
+from thermoctl.recording.stream import open_stream, texts
 from thermoctl.recording.table import Table
 
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
@@ -77,8 +77,13 @@ def write_table(path: str | Path, table: Table) -> None:
     kind = path.suffix.lower()
     if kind not in (".csv", ".parquet", ".arrow"):
         raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
-    arrow = to_arrow(table)
-    with whole_file(path) as temporary, open(temporary, "wb") as f:
+    with whole_file(path) as temporary:
+        write_arrow(temporary, kind, to_arrow(table))
+
+
+def write_arrow(path: str, kind: str, arrow: pa.Table) -> None:
+    """Write a table of Arrow; `kind`: .csv, .parquet or .arrow."""
+    with open(path, "wb") as f:
         if kind == ".csv":
             pa.csv.write_csv(arrow, f, pa.csv.WriteOptions(quoting_style="needed"))
         elif kind == ".parquet":
@@ -146,7 +151,7 @@ def _limit(path: Path, rows: int, columns: int) -> None:
         )
 
 
-def _picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
+def picked(path: Path, names: list[str], want: list[str] | None) -> list[str]:
     """Return the time column and the requested columns."""
     if want is None:
         return names
@@ -172,7 +177,7 @@ def _read_csv(path: Path, want: list[str] | None) -> Raw:
     names = _header(path, head)
     columns = None
     if body.strip():
-        chosen = _picked(path, names, want)
+        chosen = picked(path, names, want)
         _limit(path, body.count(b"\n"), len(chosen))
         try:
             arrow = pa.csv.read_csv(
@@ -188,7 +193,7 @@ def _read_csv(path: Path, want: list[str] | None) -> Raw:
             columns = None
     if columns is None:
         columns = _slow_csv(path, data, names)
-        columns = {n: columns[n] for n in _picked(path, names, want)}
+        columns = {n: columns[n] for n in picked(path, names, want)}
     return Raw(columns, {}, lambda row: f"{path}:{_csv_line(data, row)}")
 
 
@@ -285,7 +290,7 @@ def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> Raw:
         if name in names[:i]:
             raise InputError(f"{path}: the column '{name}' stands twice")
     columns = {}
-    for name in _picked(path, names, want):
+    for name in picked(path, names, want):
         column, kind = arrow[name], arrow.schema.field(name).type
         if not (
             pa.types.is_integer(kind)
@@ -300,18 +305,18 @@ def _from_arrow(path: Path, arrow: pa.Table, want: list[str] | None) -> Raw:
                 "number belongs" + (" (seconds)" if name == "t" else "")
             )
         columns[name] = to_numpy(column.cast(pa.float64(), safe=False))
-    meta = {
-        k.decode(errors="replace"): v.decode(errors="replace")
-        for k, v in (arrow.schema.metadata or {}).items()
-        if k not in (b"pandas", b"ARROW:schema")
-    }
-    return Raw(columns, meta, lambda row: f"{path}: row {row + 1}")
+    return Raw(columns, own_meta(arrow.schema), lambda row: f"{path}: row {row + 1}")
+
+
+def own_meta(schema: pa.Schema) -> dict[str, str]:
+    """Return a schema's metadata without those that pandas and Arrow add."""
+    return {k: v for k, v in texts(schema.metadata).items() if k not in ("pandas", "ARROW:schema")}
 
 
 def _read_parquet(path: Path, want: list[str] | None) -> Raw:
     with pa.parquet.ParquetFile(path) as f:
         names = f.schema_arrow.names
-        chosen = _picked(path, names, want)
+        chosen = picked(path, names, want)
         _limit(path, f.metadata.num_rows, len(chosen))
         return _from_arrow(path, f.read(columns=chosen) if len(set(names)) == len(names) else f.read(), want)
 
@@ -322,7 +327,7 @@ def _read_arrow(path: Path, want: list[str] | None) -> Raw:
         if source.size() >= 6 and source.read(6) == b"ARROW1":
             with pa.ipc.open_file(source) as f:
                 rows = sum(f.get_batch(i).num_rows for i in range(f.num_record_batches))
-                _limit(path, rows, len(_picked(path, f.schema.names, want)))
+                _limit(path, rows, len(picked(path, f.schema.names, want)))
                 return _from_arrow(path, f.read_all(), want)
     stream = open_stream(path, want and [*want, "t", "t_s"])
     batches, rows = [], 0

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.stream import open_stream
+from thermoctl.recording.stream import open_stream, texts
 from thermoctl.recording.writer import FULL, NAME, TIER, recording_files
 from thermoctl.rig.signals import NAMES
 
@@ -150,7 +150,7 @@ def rig_of(path: Path) -> str:
 
 @lru_cache(maxsize=4096)
 def _rig_of(path: Path, inode: int) -> str:
-    return (open_stream(path).schema.metadata or {}).get(b"rig", b"").decode(errors="replace")
+    return texts(open_stream(path).schema.metadata).get("rig", "")
 
 
 def _samples(path: Path, signal: str, kind: str, step_s: float, invalid: Invalid) -> tuple[np.ndarray, ...]:
@@ -191,12 +191,7 @@ def _read(path: Path, signal: str, kind: str, invalid: Invalid) -> tuple[np.ndar
     if not batches:
         return (np.empty(0),) * 4
     columns = {n: np.concatenate([b[n] for b in batches]) for n in wanted}
-    meta = {
-        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (schema.metadata or {}).items()
-    }
-    bad = (
-        np.zeros(len(columns[_CLOCK]), bool)
-        if invalid is None
-        else invalid({n: columns[n] for n in status}, meta, signal)
-    )
+    bad = np.zeros(len(columns[_CLOCK]), bool)
+    if invalid is not None:
+        bad = invalid({n: columns[n] for n in status}, texts(schema.metadata), signal)
     return columns[_CLOCK], *(np.where(bad, np.nan, columns[n]) for n in names)

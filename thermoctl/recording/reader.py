@@ -16,11 +16,11 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from thermoctl.files.safe_file import whole_file
-from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.files import READERS, read_table, to_arrow
+from thermoctl.files.yamlfile import InputError
+from thermoctl.recording.files import READERS, picked, read_table, to_arrow, write_arrow
 from thermoctl.recording.foreign import formats
 from thermoctl.recording.foreign.logger import read_recording
-from thermoctl.recording.stream import END, open_stream
+from thermoctl.recording.stream import END, open_stream, texts
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import of_recording
 
@@ -60,14 +60,8 @@ def info(path: str | Path) -> Info:
             if "wall_s" in batch.schema.names:
                 wall_end = batch.column("wall_s")[-1].as_py()
             rows, ends = rows + batch.num_rows, t[-1].as_py()
-    said = {f.name: f.metadata or {} for f in fields}
-    columns = tuple(
-        (n, m.get(b"unit", b"").decode(errors="replace"), m.get(b"meaning", b"").decode(errors="replace"))
-        for n, m in said.items()
-    )
-    meta = {
-        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (fields.metadata or {}).items()
-    }
+    said = {f.name: texts(f.metadata) for f in fields}
+    columns = tuple((n, m.get("unit", ""), m.get("meaning", "")) for n, m in said.items())
     return Info(
         str(path),
         rows,
@@ -79,7 +73,7 @@ def info(path: str | Path) -> Info:
         stream.good_bytes,
         stream.whole,
         columns,
-        meta,
+        texts(fields.metadata),
     )
 
 
@@ -164,11 +158,7 @@ def _export_table(
             formats.write_mdf(f"{folder}/export.mf4", table)
             shutil.copyfile(f"{folder}/export.mf4", out)
     else:
-        with open(out, "wb") as f:
-            if kind == ".csv":
-                pa.csv.write_csv(to_arrow(table), f)
-            else:
-                pa.parquet.write_table(to_arrow(table), f, compression="zstd")
+        write_arrow(out, kind, to_arrow(table))
     return len(table)
 
 
@@ -176,21 +166,15 @@ def _table(path: Path, want: list[str] | None) -> Table:
     if path.suffix.lower() in READERS:
         return read_table(path, want)
     table = read_recording(path)
-    for name in want or ():
-        if name not in table.columns:
-            raise InputError(f"{path}: no column '{name}'{suggest(name, table.columns)}")
-    return table if want is None else dataclasses.replace(table, columns={n: table.columns[n] for n in want})
+    names = picked(path, list(table.columns), want)
+    return dataclasses.replace(table, columns={n: table.columns[n] for n in names})
 
 
 def _export_stream(
     path: Path, out: str, kind: str, want: list[str] | None, begin_s: float, end_s: float
 ) -> int:
     if want is not None:  # an unknown name raises an error that lists the columns
-        read_names = open_stream(path).schema.names
-        for name in want:
-            if name not in read_names:
-                raise InputError(f"{path}: no column '{name}'{suggest(name, read_names)}")
-        want = [*want, "t", "t_s"]
+        want = picked(path, open_stream(path).schema.names, want)
     stream = open_stream(path, want)
     clock = "t" if "t" in stream.schema.names else "t_s"
     rows = 0

@@ -10,7 +10,7 @@ dropped.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +21,11 @@ from thermoctl.files.yamlfile import InputError
 
 END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
 CRC = b"crc32"
+
+
+def texts(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+    """Return metadata of Arrow as texts."""
+    return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
 
 
 def checksums(batch: pa.RecordBatch) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,6 +118,12 @@ def later(start: str, seconds: float) -> str:
     """Return a date some seconds later."""
     date = np.datetime64(start.rstrip("Z"), "ms") + np.timedelta64(round(seconds * 1e3), "ms")
     return f"{date}Z" if start.endswith("Z") else str(date)
+
+
+def offsets(starts: Sequence[str]) -> np.ndarray:
+    """Return the seconds of dates (N,) after the first of them."""
+    dates = np.array([s.removesuffix("Z") for s in starts], "datetime64[us]")
+    return np.asarray((dates - dates.min()) / np.timedelta64(1, "s"))
 
 
 def of_one_year(seconds: Seconds) -> Seconds:

@@ -22,12 +22,14 @@ import pyarrow.compute as pc
 
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
+from thermoctl.recording.files import own_meta
 from thermoctl.recording.foreign.clock import Seconds
 from thermoctl.recording.foreign.dialect import distinct
 from thermoctl.recording.foreign.facts import stated_step
 from thermoctl.recording.foreign.modelica import trajectories
 from thermoctl.recording.foreign.sheet import Cells, Sheet, as_cells, place_in
 from thermoctl.recording.foreign.units import spelled
+from thermoctl.recording.stream import texts
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import units
 
@@ -310,13 +312,7 @@ def _vectors(value: Any) -> dict[str, Cells]:
 
 def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
     """Return the columns of a Parquet or Arrow file; nested ones are left out with a note."""
-    said = {
-        k.decode(errors="replace"): v.decode(errors="replace")
-        for k, v in (arrow.schema.metadata or {}).items()
-    }
-    sheet = Sheet(
-        {}, place_in(path), meta={k: v for k, v in said.items() if k not in ("pandas", "ARROW:schema")}
-    )
+    sheet = Sheet({}, place_in(path), meta=own_meta(arrow.schema))
     for name, column, kind in zip(distinct(arrow.column_names), arrow.columns, arrow.schema, strict=True):
         column = column.combine_chunks()
         column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
@@ -338,7 +334,7 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
                 sheet.notes.append(f"column '{name}' left out: {column.type} is no number")
                 continue
         sheet.columns[name] = values
-        if unit := (kind.metadata or {}).get(b"unit", b"").decode(errors="replace"):
+        if unit := texts(kind.metadata).get("unit"):
             sheet.units[name] = unit
     return sheet
 

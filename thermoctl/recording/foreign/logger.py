@@ -25,6 +25,7 @@ import pyarrow.parquet
 
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording import files
+from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.cells import has_no_readings, suspected_codes
 from thermoctl.recording.foreign.dialect import cells_of, lines
 from thermoctl.recording.foreign.opening import HEAD, kind_of, sheets_of
@@ -175,8 +176,7 @@ def joined(parts: Sequence[Table]) -> Table:
     if len({str(s).endswith("Z") for s in starts if s}) > 1:
         raise InputError(f"{parts[1].path}: {MIXED}")
     if len(parts) > 1 and all(starts):
-        since = [np.datetime64(str(s).removesuffix("Z")) for s in starts]
-        offsets = [float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since]
+        offsets = clock.offsets(list(map(str, starts)))
         parts = [replace(p, t=p.t + o) for p, o in zip(parts, offsets, strict=True)]
         first = parts[int(np.argmin(offsets))]
     parts = sorted(parts, key=lambda p: p.t[0])

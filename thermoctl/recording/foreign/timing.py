@@ -421,8 +421,7 @@ def _united(path: Path, parts: Sequence[Table]) -> Table:
     if len({s.endswith("Z") for s in starts if s}) > 1:
         raise InputError(f"{path}: {MIXED}")
     if all(starts):
-        since = [np.datetime64(str(s).removesuffix("Z"), "us") for s in starts]
-        offsets = np.array([float((s - min(since)) / np.timedelta64(1, "us")) / 1e6 for s in since])
+        offsets = clock.offsets(list(map(str, starts)))
     times = [p.t + o for p, o in zip(parts, offsets, strict=True)]
     every = np.sort(np.concatenate(times))
     steps = [float(np.median(np.diff(t))) for t in times if len(t) > 1]
