@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermoctl.plant import show
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, titled
@@ -15,7 +16,6 @@ from thermoctl.report.residuals import draw_autocorrelation, draw_periodogram, t
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_COLOURS = ("#b7791f", "#2b6cb0", "#c2410c")
 CHI_SQUARE = 3.84  # 95 % point of chi square of one degree of freedom
 
 
@@ -39,18 +39,8 @@ def _picture(width: float, height: float) -> Figure:
 
 def over_time(plant: Plant, excitation: Excitation, lines: Mapping[str, np.ndarray]) -> Figure:
     """Return the measured outputs, and simulated ones (N, outputs) by label."""
-    count = len(plant.outputs)
-    picture = _picture(9, max(3.0, 1.9 * count))
-    panels = picture.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    for j, (axes, o) in enumerate(zip(panels, plant.outputs.values(), strict=True)):
-        seen = np.isfinite(excitation.y[:, j])
-        axes.plot(excitation.t[seen], excitation.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
-        for k, (label, y) in enumerate(lines.items()):
-            axes.plot(excitation.t, y[:, j], lw=1.1, color=_COLOURS[-len(lines) :][k], label=label)
-        axes.set_ylabel(f"{o.name}\n[{o.unit or '1'}]", fontsize=8)
-        axes.grid(alpha=0.3)
-    panels[0].legend(loc="upper right", fontsize=8)
-    panels[-1].set_xlabel("t [s]")
+    picture = _picture(9, max(3.0, 1.9 * len(plant.outputs)))
+    show.over_time(picture, plant, excitation, lines)
     return picture
 
 

@@ -191,19 +191,10 @@ def _plot(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    count = len(model.outputs)
-    figure = Figure(figsize=(10, max(3.0, 1.9 * count)), layout="constrained")
+    figure = Figure(figsize=(10, max(3.0, 1.9 * len(model.outputs))), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    for j, (axes, o) in enumerate(zip(panels, model.plant.outputs.values(), strict=True)):
-        seen = np.isfinite(excitation.y[:, j])
-        axes.plot(excitation.t[seen], excitation.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
-        axes.plot(excitation.t, y[:, j], lw=1.1, color="#c2410c", label="simulated")
-        axes.set_ylabel(f"{o.name}\n[{o.unit or '?'}]", fontsize=8)
-        axes.grid(alpha=0.3)
-    panels[0].legend(loc="upper right", fontsize=8)
+    panels = drawing.over_time(figure, model.plant, excitation, {"simulated": y})
     panels[0].set_title(f"{model.plant.title}: {table.name}", fontsize=10)
-    panels[-1].set_xlabel("t [s]")
     with whole_file(name) as part:
         try:
             figure.savefig(part, dpi=120, format=name.suffix[1:] or None)

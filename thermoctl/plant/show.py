@@ -1,4 +1,4 @@
-"""A plant as a picture: nodes, flows, outputs.
+"""Pictures: a plant with its nodes, flows and outputs, and its outputs over time.
 
 The layout minimises stress, sum of (|x_i - x_j| - d_ij)^2 / d_ij^2 with d the distance in the graph, by
 majorisation (Gansner, Koren, North 2004). Flows to and from the outside and outputs are small satellites of
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Text
 
+    from thermoctl.plant.simulation.simulate import Excitation
 
 Vertex = tuple[str, str, str]
 Edge = tuple[int, int, str, str]
@@ -168,6 +169,22 @@ def drawing(plant: Plant, marked: Collection[str] = (), widest: float = 40.0, ti
     return figure
 
 
+def over_time(figure: Figure, plant: Plant, excitation: Excitation, lines: Mapping[str, np.ndarray]) -> Any:
+    """Draw the measured outputs, and simulated ones (N, outputs) by label; return the axes of each output."""
+    panels = figure.subplots(len(plant.outputs), 1, sharex=True, squeeze=False)[:, 0]
+    for j, (axes, o) in enumerate(zip(panels, plant.outputs.values(), strict=True)):
+        seen = np.isfinite(excitation.y[:, j])
+        axes.plot(excitation.t[seen], excitation.y[seen, j], ".", ms=2, color="#7a8894", label="measured")
+        for (label, y), colour in zip(lines.items(), _COLOURS[-len(lines) :], strict=False):
+            axes.plot(excitation.t, y[:, j], lw=1.1, color=colour, label=label)
+        axes.set_ylabel(f"{o.name}\n[{o.unit or '?'}]", fontsize=8)
+        axes.grid(alpha=0.3)
+    panels[0].legend(loc="upper right", fontsize=8)
+    panels[-1].set_xlabel("t [s]")
+    return panels
+
+
+_COLOURS = ("#b7791f", "#2b6cb0", "#c2410c")  # colour a line; fewer lines take the last ones
 UNIT_IN = np.array([1.5, 0.85])  # inches of a unit of length, before texts push each other apart
 APART_IN = 0.12  # least distance of two boxes
 BARE_IN = 0.4  # least length of an edge beside its label
