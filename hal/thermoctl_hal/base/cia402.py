@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 
 from thermoctl.files.yamlfile import InputError, Node, Section, integer_of, kind_of
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, AMP_QUICK_STOP
-from thermoctl_hal.base.key import REQUIRED, Key, take, whole_range
+from thermoctl_hal.base.key import Key, take, whole, whole_range
 from thermoctl_hal.base.profile import FIELD_TYPES, Amplifier, Object
 from thermoctl_hal.base.wire import nearest
 
@@ -59,9 +59,9 @@ _TYPES = {
 STANDARD_TYPES = {Object(index): t for index, t in _TYPES.items()}
 """Types of objects that CiA 301 and CiA 402-2 define: for drives without an EDS file."""
 START_UP: tuple[Key, ...] = (
-    Key("index", "integer", "index of the object", REQUIRED, "", 0x1000, 0xFFFF, example="0x6075"),
-    Key("sub", "integer", "sub-index", 0, "", 0, 255),
-    Key("value", "integer", "the number written", REQUIRED, "", -(2**31), 2**32, example="2500"),
+    whole("index", "index of the object", 0x1000, 0xFFFF, example="0x6075"),
+    whole("sub", "sub-index", 0, 255, default=0),
+    whole("value", "the number written", -(2**31), 2**32, example="2500"),
 )
 """Keys of an object that is written at set-up."""
 

@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of, suggest
@@ -31,11 +32,34 @@ class Key:
     example: str = ""
 
 
+def _key(kind: str, name: str, meaning: str, default: Any = REQUIRED, **more: Any) -> Key:
+    return Key(name, kind, meaning, default, **more)
+
+
+def _ranged(
+    kind: str,
+    name: str,
+    meaning: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    unit: str = "",
+    default: Any = REQUIRED,
+    example: str = "",
+) -> Key:
+    return Key(name, kind, meaning, default, unit, low, high, example=example)
+
+
+text, flag, node = partial(_key, "text"), partial(_key, "flag"), partial(_key, "node")
+listed, section = partial(_key, "list"), partial(_key, "section")
+whole, number = partial(_ranged, "integer"), partial(_ranged, "number")
+"""Make a key of a kind: name, meaning, then its default, or the limits of a number."""
+
+
 def bits_of(of: str) -> tuple[Key, ...]:
     """Return the keys of a value that consists of some bits of another value."""
     return (
-        Key("low_bit", "integer", f"lowest bit of the value inside {of}", 0, "", 0, 63, example="4"),
-        Key("bits", "integer", f"number of bits of the value; 0: all of {of}", 0, "", 0, 64, example="19"),
+        whole("low_bit", f"lowest bit of the value inside {of}", 0, 63, default=0, example="4"),
+        whole("bits", f"number of bits of the value; 0: all of {of}", 0, 64, default=0, example="19"),
     )
 
 

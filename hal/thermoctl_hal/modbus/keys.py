@@ -2,94 +2,71 @@
 
 from __future__ import annotations
 
-from thermoctl_hal.base.key import REQUIRED, Key, bits_of
+from thermoctl_hal.base.key import Key, bits_of, flag, listed, node, number, section, text, whole
 
 MAX_ADDRESS, MAX_MODBUS_BITS = 65535, 64
 
 MODBUS: dict[str, tuple[Key, ...]] = {
     "modbus": (
-        Key("unit_id", "integer", "unit (binding: `address`); above 247 only on TCP", 1, "", 0, 255),
-        Key("timeout_s", "number", "longest time for an answer", 0.3, "s", 0.01, 10),
-        Key("max_gap", "integer", "registers are read together over gaps of up to this many", 8, "", 0, 100),
-        Key("max_block", "integer", "registers read by one request, at most", 100, "", 1, 125),
+        whole("unit_id", "unit (binding: `address`); above 247 only on TCP", 0, 255, default=1),
+        number("timeout_s", "longest time for an answer", 0.01, 10, "s", default=0.3),
+        whole("max_gap", "registers are read together over gaps of up to this many", 0, 100, default=8),
+        whole("max_block", "registers read by one request, at most", 1, 125, default=100),
     ),
     "channel of modbus": (
-        Key(
+        text(
             "kind",
-            "text",
             "input (function 4), holding (3), discrete (2) or coil (1)",
             "input",
             choices=("input", "holding", "discrete", "coil"),
         ),
-        Key(
+        whole(
             "register",
-            "integer",
             "address from 0: a manual's 40001 is kind: holding, register: 0",
-            REQUIRED,
-            "",
             0,
             MAX_ADDRESS,
             example="0",
         ),
-        Key("type", "text", "int16 .. int64, uint16 .. uint64, float32, float64, bcd16, bcd32", "int16"),
-        Key(
+        text("type", "int16 .. int64, uint16 .. uint64, float32, float64, bcd16, bcd32", "int16"),
+        text(
             "word_order",
-            "text",
             "order of the words of a value: big is a manual's ABCD, little CDAB; with byte_order little BADC, DCBA",
             "big",
             choices=("big", "little"),
         ),
-        Key("byte_order", "text", "order of the two bytes of a word", "big", choices=("big", "little")),
+        text("byte_order", "order of the two bytes of a word", "big", choices=("big", "little")),
         *bits_of("the register"),
-        Key("signed", "flag", "the bits are a two's complement", False),
-        Key(
+        flag("signed", "the bits are a two's complement", False),
+        listed(
             "sentinels",
-            "list",
             "raw numbers that mean 'no sensor'; 0x.. are the bits of the register",
             None,
             example="[32767, 0x8000]",
         ),
-        Key(
+        whole(
             "scale_register",
-            "integer",
             "register of a whole number n with sign: the value counts 10^n (SunSpec's scale factors)",
-            None,
-            "",
             0,
             MAX_ADDRESS,
+            default=None,
             example="40077",
         ),
-        Key("invalid", "section", "a register or bit that says that the reading is wrong (open wire)", None),
+        section("invalid", "a register or bit that says that the reading is wrong (open wire)", None),
     ),
     "invalid of modbus": (
-        Key("kind", "text", "as of a channel", "input", choices=("input", "holding", "discrete", "coil")),
-        Key("register", "integer", "address from 0", REQUIRED, "", 0, MAX_ADDRESS, example="120"),
-        Key(
-            "mask",
-            "integer",
-            "bits of the register that are looked at",
-            0xFFFF,
-            "",
-            1,
-            0xFFFF,
-            example="0x0300",
-        ),
-        Key("good", "integer", "their value when the reading is good", 0, "", 0, 0xFFFF),
+        text("kind", "as of a channel", "input", choices=("input", "holding", "discrete", "coil")),
+        whole("register", "address from 0", 0, MAX_ADDRESS, example="120"),
+        whole("mask", "bits of the register that are looked at", 1, 0xFFFF, default=0xFFFF, example="0x0300"),
+        whole("good", "their value when the reading is good", 0, 0xFFFF, default=0),
     ),
     "message of modbus": (
-        Key("kind", "text", "holding or coil", "holding", choices=("holding", "coil")),
-        Key("register", "integer", "address from 0", REQUIRED, "", 0, MAX_ADDRESS),
-        Key("type", "text", "as of a channel", "int16"),
-        Key("word_order", "text", "order of the words", "big", choices=("big", "little")),
-        Key("value", "node", "the number written, or `command`"),
-        Key(
-            "function",
-            "integer",
-            "6 or 16 for registers, 5 for coils; 0: by the number of registers",
-            0,
-            "",
-            0,
-            16,
+        text("kind", "holding or coil", "holding", choices=("holding", "coil")),
+        whole("register", "address from 0", 0, MAX_ADDRESS),
+        text("type", "as of a channel", "int16"),
+        text("word_order", "order of the words", "big", choices=("big", "little")),
+        node("value", "the number written, or `command`"),
+        whole(
+            "function", "6 or 16 for registers, 5 for coils; 0: by the number of registers", 0, 16, default=0
         ),
     ),
 }
