@@ -46,59 +46,65 @@ def argument(*flags: str, **options: Any) -> Argument:
     return Argument(flags, options)
 
 
+def option(flag: str, metavar: str, help: str, **more: Any) -> Argument:
+    """Return an option with a value, which the help shows as `metavar`."""
+    return argument(flag, metavar=metavar, help=help, **more)
+
+
+def switch(flag: str, help: str) -> Argument:
+    """Return an option without a value."""
+    return argument(flag, action="store_true", help=help)
+
+
 def command(name: str, help: str, function: str, takes: str, *arguments: Argument) -> Command:
     """Return a command's row."""
     return Command(name, help, function, takes, arguments)
 
 
-CONFIG = argument(
+CONFIG = option(
     "--config",
-    metavar="FILE",
-    help="configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
+    "FILE",
+    "configuration (else $THERMOCTL_CONFIG, config/simulated.yaml, /etc/thermoctl/rig.yaml)",
 )
 """The option of every command that needs a rig; `which_rig.choose` stores the path that it found."""
-AXIS = argument("--axis", metavar="NAME", help="the axis of a rig with several")
+AXIS = option("--axis", "NAME", "the axis of a rig with several")
 """Goes with CONFIG, except for ALL_AXES (see `takes_axis`)."""
 FILE = argument("file", nargs="?", metavar="CONFIG", help="the same as --config CONFIG")
-YES = argument(
-    "--yes", action="store_true", help="start without asking; without a terminal, required to move a rig"
-)
-JSON = argument("--json", action="store_true", help="print one JSON object, for programs")
-PLANT = argument("--plant", required=True, metavar="PLANT", help="the plant file, or an FMU")
-MAP = argument(
-    "--map",
-    metavar="FILE",
-    help="with an FMU as the plant: columns, roles, units, noise and ranges of its variables",
+YES = switch("--yes", "start without asking; without a terminal, required to move a rig")
+JSON = switch("--json", "print one JSON object, for programs")
+PLANT = option("--plant", "PLANT", "the plant file, or an FMU", required=True)
+MAP = option(
+    "--map", "FILE", "with an FMU as the plant: columns, roles, units, noise and ranges of its variables"
 )
 FORMATS = "text of any dialect, .xlsx, .mat, .mf4, .tdms, .json, .parquet, .arrow"
 """The formats of recordings that every command reads, for help texts."""
 RECORDINGS = argument("recordings", nargs="+", metavar="REC", help=f"recordings ({FORMATS})")
-TIME = argument(
+TIME = option(
     "--time",
-    metavar="COLUMN|STEP",
-    help="the column of times (default: found by its cells, its name and unit, and that it increases); or the time from "
+    "COLUMN|STEP",
+    "the column of times (default: found by its cells, its name and unit, and that it increases); or the time from "
     "row to row, such as 0.1s or '10 ms'",
 )
-COLUMNS = argument(
+COLUMNS = option(
     "--columns",
-    metavar="NAME=COLUMN,...",
-    help="names that the plant reads, and the recordings' columns that they stand for",
+    "NAME=COLUMN,...",
+    "names that the plant reads, and the recordings' columns that they stand for",
 )
 READING = (
     TIME,
     COLUMNS,
-    argument("--sheet", metavar="NAME", help="the sheet (Excel), group (TDMS) or variable (MATLAB) to read"),
-    argument(
+    option("--sheet", "NAME", "the sheet (Excel), group (TDMS) or variable (MATLAB) to read"),
+    option(
         "--missing",
-        metavar="WORD,...",
-        help="further words or numbers that mean 'no value', as in --missing=-9999,'not ready'",
+        "WORD,...",
+        "further words or numbers that mean 'no value', as in --missing=-9999,'not ready'",
     ),
     argument(
         "--decimal",
         choices=(".", ","),
         help="the decimal sign, where a file's numbers can be read in two ways",
     ),
-    argument("--run", type=int, metavar="N", help="of several runs in a file, the one to read, from 1"),
+    option("--run", "N", "of several runs in a file, the one to read, from 1", type=int),
     argument(
         "--equal-times",
         choices=("spread", "mean", "first", "last"),
@@ -106,11 +112,7 @@ READING = (
     ),
 )
 """How a recording of any logger is read."""
-EFFECTS = argument(
-    "--effects", action="append", metavar="DIR", help="a further folder of effect files (repeatable)"
-)
-MODELS = argument(
-    "--models", metavar="DIR", help="folder of calibrations (default models; of an axis models/AXIS)"
-)
+EFFECTS = option("--effects", "DIR", "a further folder of effect files (repeatable)", action="append")
+MODELS = option("--models", "DIR", "folder of calibrations (default models; of an axis models/AXIS)")
 ORDER = argument("--order", type=int, default=0, help="number of real poles (default 0: chosen by BIC)")
-ROOT = argument("--root", default="/", metavar="DIR", help="install below this directory")
+ROOT = option("--root", "DIR", "install below this directory", default="/")

@@ -15,6 +15,8 @@ from thermoctl.command import (
     Table,
     argument,
     command,
+    option,
+    switch,
 )
 
 TABLE: Table = {
@@ -26,11 +28,11 @@ TABLE: Table = {
             "",
             argument("plants", nargs="+", metavar="PLANT"),
             MAP,
-            argument(
+            option(
                 "--data",
+                "REC",
+                f"recordings to check with the plant ({FORMATS}); exit 1 on a severe fault",
                 nargs="+",
-                metavar="REC",
-                help=f"recordings to check with the plant ({FORMATS}); exit 1 on a severe fault",
             ),
             *READING,
         ),
@@ -43,20 +45,17 @@ TABLE: Table = {
             MAP,
             RECORDINGS,
             *READING,
-            argument(
+            option(
                 "--initial",
-                metavar="NODE=VALUE,...",
-                help="initial values of nodes; or `steady`, the steady state of the first inputs; or a recording: its last "
+                "NODE=VALUE,...",
+                "initial values of nodes; or `steady`, the steady state of the first inputs; or a recording: its last "
                 "state (default: the plant file's; without first readings the steady state)",
             ),
-            argument(
-                "--horizon",
-                type=float,
-                metavar="S",
-                help="predict at most S seconds ahead, re-initialised from the data",
+            option(
+                "--horizon", "S", "predict at most S seconds ahead, re-initialised from the data", type=float
             ),
-            argument("--out", metavar="FILE", help="write time series (.csv, .parquet, .arrow)"),
-            argument("--plot", metavar="FILE", help="draw measured and simulated outputs (.png, .svg)"),
+            option("--out", "FILE", "write time series (.csv, .parquet, .arrow)"),
+            option("--plot", "FILE", "draw measured and simulated outputs (.png, .svg)"),
         ),
         command(
             "refit",
@@ -67,26 +66,16 @@ TABLE: Table = {
             MAP,
             RECORDINGS,
             *READING,
-            argument("--out", metavar="PLANT2", help="write the refitted plant"),
-            argument(
-                "--held-out", nargs="+", metavar="REC", help="recordings for validation; not used in the fit"
-            ),
+            option("--out", "PLANT2", "write the refitted plant"),
+            option("--held-out", "REC", "recordings for validation; not used in the fit", nargs="+"),
             argument(
                 "--noise",
                 choices=["white", "ar1"],
                 default="white",
                 help="noise model (default white; ar1 is estimated)",
             ),
-            argument(
-                "--tries",
-                type=int,
-                default=0,
-                metavar="N",
-                help="random starting points in the ranges (default 0)",
-            ),
-            argument(
-                "--anyway", action="store_true", help="refit in spite of a severe finding of the checks"
-            ),
+            option("--tries", "N", "random starting points in the ranges (default 0)", type=int, default=0),
+            switch("--anyway", "refit in spite of a severe finding of the checks"),
         ),
     ),
     DIAGNOSE: (
@@ -97,17 +86,17 @@ TABLE: Table = {
             "",
             PLANT,
             MAP,
-            argument(
+            option(
                 "--like",
+                "REC",
+                "a recording with the inputs and times of the experiment (repeatable); its readings do not count",
                 action="append",
-                metavar="REC",
-                help="a recording with the inputs and times of the experiment (repeatable); its readings do not count",
             ),
-            argument(
+            option(
                 "--limit",
+                "NAME=LOW:HIGH",
+                "range of an input that can be driven; without --like it goes through levels (repeatable)",
                 action="append",
-                metavar="NAME=LOW:HIGH",
-                help="range of an input that can be driven; without --like it goes through levels (repeatable)",
             ),
             *READING,
             EFFECTS,

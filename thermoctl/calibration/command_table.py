@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import CALIBRATE, CONFIG, MODELS, ORDER, YES, Table, argument, command
+from thermoctl.command import CALIBRATE, CONFIG, MODELS, ORDER, YES, Table, argument, command, option, switch
 
 TABLE: Table = {
     CALIBRATE: (
@@ -13,12 +13,12 @@ TABLE: Table = {
             "thermoctl.calibration.commands:calibrate",
             "config out models order gains accept again yes",
             CONFIG,
-            argument("--out", metavar="DIR", help="the calibration's folder (default calibration/RIG)"),
+            option("--out", "DIR", "the calibration's folder (default calibration/RIG)"),
             MODELS,
             ORDER,
-            argument("--gains", action="store_true", help="on acceptance also write the proven PID gains"),
-            argument("--accept", action="store_true", help="install the model when the proof is done"),
-            argument("--again", action="store_true", help="discard an earlier run in the folder"),
+            switch("--gains", "on acceptance also write the proven PID gains"),
+            switch("--accept", "install the model when the proof is done"),
+            switch("--again", "discard an earlier run in the folder"),
             YES,
         ),
         command(
@@ -28,10 +28,9 @@ TABLE: Table = {
             "thermoctl.calibration.commands:tune",
             "config write yes",
             CONFIG,
-            argument(
+            switch(
                 "--write",
-                action="store_true",
-                help="prove each step towards the proposal on the rig, then write it into the configuration",
+                "prove each step towards the proposal on the rig, then write it into the configuration",
             ),
             YES,
         ),
@@ -44,18 +43,14 @@ TABLE: Table = {
                 "name", metavar="NAME|FILE", help="a test of experiments.yaml, or a file with one experiment"
             ),
             CONFIG,
-            argument(
+            option(
                 "--plant",
-                metavar="PLANT",
-                help="simulate this plant file instead of the rig, for inputs that the daemon cannot drive",
+                "PLANT",
+                "simulate this plant file instead of the rig, for inputs that the daemon cannot drive",
             ),
-            argument(
-                "--out", metavar="FILE", help="recording (.parquet, .csv, .arrow; default NAME.parquet)"
-            ),
-            argument(
-                "--dry-run", action="store_true", help="show schedule, power and spectrum; drive nothing"
-            ),
-            argument("--resume", action="store_true", help="continue an aborted recording"),
+            option("--out", "FILE", "recording (.parquet, .csv, .arrow; default NAME.parquet)"),
+            switch("--dry-run", "show schedule, power and spectrum; drive nothing"),
+            switch("--resume", "continue an aborted recording"),
             YES,
         ),
         command(

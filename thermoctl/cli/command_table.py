@@ -16,6 +16,8 @@ from thermoctl.command import (
     Table,
     argument,
     command,
+    option,
+    switch,
 )
 
 TABLE: Table = {
@@ -26,18 +28,10 @@ TABLE: Table = {
             "thermoctl.cli.joined:run",
             "",
             CONFIG,
-            argument(
-                "--simulated-time", action="store_true", help="run the simulated rig as fast as possible"
-            ),
-            argument("--hours", type=float, metavar="H", help="hours of rig time (with --simulated-time)"),
-            argument(
-                "--no-compensation",
-                action="store_true",
-                help="switch compensation off (with --simulated-time)",
-            ),
-            argument(
-                "--out", metavar="FILE", help="write 10 rows a second as Parquet (with --simulated-time)"
-            ),
+            switch("--simulated-time", "run the simulated rig as fast as possible"),
+            option("--hours", "H", "hours of rig time (with --simulated-time)", type=float),
+            switch("--no-compensation", "switch compensation off (with --simulated-time)"),
+            option("--out", "FILE", "write 10 rows a second as Parquet (with --simulated-time)"),
         ),
         command(
             "virtual-rig",
@@ -45,11 +39,11 @@ TABLE: Table = {
             "thermoctl.cli.joined:virtual_rig",
             "settings tell",
             CONFIG,
-            argument(
+            option(
                 "--tell",
-                metavar="LINE",
+                "LINE",
+                "inject a fault into the running virtual rig, or clear it, as 'encoder unplug' ('help' lists all)",
                 default="",
-                help="inject a fault into the running virtual rig, or clear it, as 'encoder unplug' ('help' lists all)",
             ),
         ),
         command(
@@ -75,99 +69,72 @@ TABLE: Table = {
                 help=f"recordings ({FORMATS}) or patterns of them ('runs/*.csv'), or folders of many rigs' "
                 "recordings: one diagnosis a rig",
             ),
-            argument(
-                "--together",
-                action="store_true",
-                help="with folders: all recordings in them are of one rig, for one diagnosis",
-            ),
-            argument("--plant", metavar="FILE", help="the plant file, or an FMU"),
+            switch("--together", "with folders: all recordings in them are of one rig, for one diagnosis"),
+            option("--plant", "FILE", "the plant file, or an FMU"),
             MAP,
-            argument(
+            option(
                 "--held-out",
-                action="append",
-                metavar="REC",
-                help="recording that takes no part in any choice and measures what the findings are worth (repeatable; "
+                "REC",
+                "recording that takes no part in any choice and measures what the findings are worth (repeatable; "
                 "default: the last of three or more)",
+                action="append",
             ),
             *READING,
-            argument(
-                "--anyway",
-                action="store_true",
-                help="diagnose although the checks of the data found a severe fault",
+            switch("--anyway", "diagnose although the checks of the data found a severe fault"),
+            option(
+                "--out", "DIR", "folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)"
             ),
-            argument(
-                "--out",
-                metavar="DIR",
-                help="folder of diagnosis.json, plant.yaml and report.html (with folders: DIR/RIG)",
-            ),
-            argument(
+            option(
                 "--continue",
+                "DIR",
+                "go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
                 dest="continued",
-                metavar="DIR",
-                help="go on from the diagnosis in DIR with recordings that it has not seen, without its old ones",
             ),
-            argument("--explain", metavar="DIR", help="print the reasons of the diagnosis in DIR"),
-            argument(
+            option("--explain", "DIR", "print the reasons of the diagnosis in DIR"),
+            option(
                 "--why",
-                metavar="EFFECT",
-                help="with --explain: in one line why this effect (NAME, or 'NAME at PLACE') is a finding or none",
+                "EFFECT",
+                "with --explain: in one line why this effect (NAME, or 'NAME at PLACE') is a finding or none",
             ),
-            argument(
+            option(
                 "--last",
+                "N",
+                "with folders: use each rig's newest N recordings (default 2)",
                 type=int,
                 default=2,
-                metavar="N",
-                help="with folders: use each rig's newest N recordings (default 2)",
             ),
-            argument(
-                "--workers", type=int, metavar="N", help="with folders: local processes (default one a core)"
-            ),
-            argument(
+            option("--workers", "N", "with folders: local processes (default one a core)", type=int),
+            option(
                 "--scheduler",
-                metavar="ADDRESS",
-                help="a Dask scheduler (tcp://...): its workers compute by recording; with folders by rig, from the same files",
+                "ADDRESS",
+                "a Dask scheduler (tcp://...): its workers compute by recording; with folders by rig, from the same files",
             ),
             EFFECTS,
-            argument(
+            option(
                 "--drive",
-                action="append",
-                metavar="INPUT",
-                help="an input that the next experiment may drive (repeatable; default: inputs that changed in the "
+                "INPUT",
+                "an input that the next experiment may drive (repeatable; default: inputs that changed in the "
                 "recordings, except the surroundings)",
-            ),
-            argument(
-                "--limit",
                 action="append",
-                metavar="NAME=LOW:HIGH",
-                help="range of an input or output in the next experiment (repeatable; default: the recorded range)",
             ),
-            argument(
+            option(
+                "--limit",
+                "NAME=LOW:HIGH",
+                "range of an input or output in the next experiment (repeatable; default: the recorded range)",
+                action="append",
+            ),
+            switch(
                 "--live",
-                action="store_true",
-                help="use the daemon's own recordings (--config) from the time when its model no longer fits",
+                "use the daemon's own recordings (--config) from the time when its model no longer fits",
             ),
-            argument(
-                "--hours", type=float, default=4.0, metavar="H", help="with --live: how far back (default 4)"
-            ),
-            argument(
-                "--resolve",
-                action="store_true",
-                help="run the next experiment on the rig, then diagnose with its data",
-            ),
+            option("--hours", "H", "with --live: how far back (default 4)", type=float, default=4.0),
+            switch("--resolve", "run the next experiment on the rig, then diagnose with its data"),
             YES,
-            argument(
-                "--rounds",
-                type=int,
-                default=3,
-                metavar="N",
-                help="with --resolve: at most N experiments (default 3)",
-            ),
-            argument(
-                "--rig", metavar="PLANT", help="with --resolve: simulate this plant file instead of the rig"
-            ),
+            option("--rounds", "N", "with --resolve: at most N experiments (default 3)", type=int, default=3),
+            option("--rig", "PLANT", "with --resolve: simulate this plant file instead of the rig"),
             CONFIG,
-            argument("--json", action="store_true", help="print the result as JSON"),
-            argument("--quiet", action="store_true", help="print neither progress nor summary"),
+            switch("--json", "print the result as JSON"),
+            switch("--quiet", "print neither progress nor summary"),
         ),
         command(
             "effects",
@@ -182,10 +149,8 @@ TABLE: Table = {
                 metavar="NAME|FILE|DIR",
                 help="an effect's name; files or folders of effects; a diagnosis and a name",
             ),
-            argument(
-                "--plant",
-                metavar="PLANT",
-                help="with check: a plant to put the effects into (default: the shipped ones)",
+            option(
+                "--plant", "PLANT", "with check: a plant to put the effects into (default: the shipped ones)"
             ),
             EFFECTS,
         ),
@@ -204,19 +169,10 @@ TABLE: Table = {
             "thermoctl.cli.support:report",
             "settings out seconds",
             CONFIG,
-            argument(
-                "--out",
-                default="thermoctl-report.zip",
-                metavar="FILE",
-                help="the archive (default thermoctl-report.zip)",
+            option(
+                "--out", "FILE", "the archive (default thermoctl-report.zip)", default="thermoctl-report.zip"
             ),
-            argument(
-                "--seconds",
-                type=float,
-                default=60.0,
-                metavar="S",
-                help="of the newest recording (default 60)",
-            ),
+            option("--seconds", "S", "of the newest recording (default 60)", type=float, default=60.0),
         ),
         command(
             "completion",

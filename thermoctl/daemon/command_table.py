@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import CONFIG, FILE, JSON, LOOK, RUN, Table, argument, command
+from thermoctl.command import CONFIG, FILE, JSON, LOOK, RUN, Table, argument, command, option, switch
 
 TABLE: Table = {
     RUN: (
@@ -12,7 +12,7 @@ TABLE: Table = {
             "thermoctl.daemon.views.demo:demo",
             "settings seconds",
             CONFIG,
-            argument("--seconds", type=float, metavar="S", help="stop after S seconds"),
+            option("--seconds", "S", "stop after S seconds", type=float),
         ),
         command(
             "start",
@@ -95,18 +95,8 @@ TABLE: Table = {
             "thermoctl.daemon.views.monitor:show",
             "settings interval once",
             CONFIG,
-            argument(
-                "--interval",
-                type=float,
-                default=0.5,
-                metavar="S",
-                help="seconds between two updates (default 0.5)",
-            ),
-            argument(
-                "--once",
-                action="store_true",
-                help="print one screen; exit 1 when no daemon runs or a fault is active",
-            ),
+            option("--interval", "S", "seconds between two updates (default 0.5)", type=float, default=0.5),
+            switch("--once", "print one screen; exit 1 when no daemon runs or a fault is active"),
         ),
         command(
             "dashboard",
@@ -114,30 +104,22 @@ TABLE: Table = {
             "thermoctl.daemon.views.dashboard:serve",
             "settings listen commands metrics token_file rate name",
             CONFIG,
-            argument(
+            option(
                 "--listen",
-                metavar="ADDRESS:PORT",
+                "ADDRESS:PORT",
+                "address to serve on (default %(default)s); beyond this machine reading needs the token, too",
                 default="127.0.0.1:8765",
-                help="address to serve on (default %(default)s); beyond this machine reading needs the token, too",
             ),
-            argument(
-                "--commands", action="store_true", help="accept arm, disarm and setpoint, with the token"
-            ),
-            argument("--metrics", action="store_true", help="serve Prometheus metrics at /metrics"),
-            argument(
+            switch("--commands", "accept arm, disarm and setpoint, with the token"),
+            switch("--metrics", "serve Prometheus metrics at /metrics"),
+            option(
                 "--token-file",
-                metavar="FILE",
-                help="file of the token (else $THERMOCTL_DASHBOARD_TOKEN, else a new one is printed)",
+                "FILE",
+                "file of the token (else $THERMOCTL_DASHBOARD_TOKEN, else a new one is printed)",
             ),
-            argument(
-                "--rate", type=float, default=20.0, metavar="HZ", help="frames a second, 1 to 50 (default 20)"
-            ),
-            argument(
-                "--name",
-                action="append",
-                default=[],
-                metavar="HOST",
-                help="accepted host name in requests (repeatable)",
+            option("--rate", "HZ", "frames a second, 1 to 50 (default 20)", type=float, default=20.0),
+            option(
+                "--name", "HOST", "accepted host name in requests (repeatable)", action="append", default=[]
             ),
         ),
         command(
@@ -146,17 +128,12 @@ TABLE: Table = {
             "thermoctl.daemon.views.mqtt:publish",
             "settings broker topic rate user password_file tls",
             CONFIG,
-            argument("--broker", required=True, metavar="HOST[:PORT]", help="the broker"),
-            argument(
-                "--topic",
-                default="",
-                metavar="TOPIC",
-                help="first part of every topic (default thermoctl/RIG)",
-            ),
-            argument("--rate", type=float, default=1.0, metavar="HZ", help="messages a second (default 1)"),
-            argument("--user", default="", metavar="NAME", help="the broker's user name"),
-            argument("--password-file", metavar="FILE", help="file of the user's password"),
-            argument("--tls", action="store_true", help="encrypt, with the system's certificates"),
+            option("--broker", "HOST[:PORT]", "the broker", required=True),
+            option("--topic", "TOPIC", "first part of every topic (default thermoctl/RIG)", default=""),
+            option("--rate", "HZ", "messages a second (default 1)", type=float, default=1.0),
+            option("--user", "NAME", "the broker's user name", default=""),
+            option("--password-file", "FILE", "file of the user's password"),
+            switch("--tls", "encrypt, with the system's certificates"),
         ),
         command(
             "latency",

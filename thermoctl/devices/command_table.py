@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import RUN, Table, argument, command
+from thermoctl.command import RUN, Table, argument, command, option
 
 TABLE: Table = {
     RUN: (
@@ -39,12 +39,8 @@ TABLE: Table = {
             "thermoctl.devices.probe:probe",
             "port profile address seconds baud",
             argument("port", metavar="PORT"),
-            argument(
-                "--profile", default="", metavar="NAME", help="profile: a file, or a name of the library"
-            ),
-            argument(
-                "--address", type=int, metavar="N", help="unit, node id or address (default: the profile's)"
-            ),
+            option("--profile", "NAME", "profile: a file, or a name of the library", default=""),
+            option("--address", "N", "unit, node id or address (default: the profile's)", type=int),
             argument("--seconds", type=float, default=3.0, help="longest time to read for (default 3)"),
             argument("--baud", type=int, default=9600, help="baud rate without a profile (default 9600)"),
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import MODEL, READING, Table, argument, command
+from thermoctl.command import MODEL, READING, Table, argument, command, option
 
 TABLE: Table = {
     MODEL: (
@@ -13,15 +13,11 @@ TABLE: Table = {
             "",
             argument("plant", metavar="PLANT"),
             argument("--to", required=True, choices=["fmu", "modelica", "python", "c"], help="the language"),
-            argument(
-                "--out",
-                metavar="FILE",
-                help="the file (default: the plant's name with the language's ending)",
-            ),
-            argument(
+            option("--out", "FILE", "the file (default: the plant's name with the language's ending)"),
+            option(
                 "--data",
-                metavar="REC",
-                help="a recording: first readings, this recording's parameters, and the widths of jumps",
+                "REC",
+                "a recording: first readings, this recording's parameters, and the widths of jumps",
             ),
             *READING,
         ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import JSON, MANY_RIGS, Table, argument, command
+from thermoctl.command import JSON, MANY_RIGS, Table, argument, command, option
 
 TABLE: Table = {
     MANY_RIGS: (
@@ -15,18 +15,10 @@ TABLE: Table = {
             argument(
                 "folder", metavar="FOLDER", help="a folder, or a path in an object store as s3://BUCKET/RIGS"
             ),
-            argument("--plant", metavar="FILE", help="plant file to compare the recordings with"),
-            argument(
-                "--parameters", default="", metavar="A,B", help="the plant's parameters to follow over time"
-            ),
-            argument(
-                "--workers",
-                type=int,
-                default=0,
-                metavar="N",
-                help="local Dask processes (default 0: this process)",
-            ),
-            argument("--scheduler", metavar="ADDRESS", help="a Dask cluster"),
+            option("--plant", "FILE", "plant file to compare the recordings with"),
+            option("--parameters", "A,B", "the plant's parameters to follow over time", default=""),
+            option("--workers", "N", "local Dask processes (default 0: this process)", type=int, default=0),
+            option("--scheduler", "ADDRESS", "a Dask cluster"),
             JSON,
         ),
     )

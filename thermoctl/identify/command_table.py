@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import MODEL, Table, argument, command
+from thermoctl.command import MODEL, Table, argument, command, option, switch
 
 TABLE: Table = {
     MODEL: (
@@ -12,25 +12,17 @@ TABLE: Table = {
             "thermoctl.identify.commands:linearise",
             "",
             argument("plant", metavar="PLANT"),
-            argument("--out", metavar="MODEL", help="the model file"),
-            argument("--replace", action="store_true", help="overwrite MODEL"),
-            argument(
-                "--rig", default="simulated", metavar="NAME", help="name of the rig (default simulated)"
-            ),
-            argument(
-                "--points",
-                metavar="FILE",
-                help="rig file or points file with the points (default: the paper's)",
-            ),
-            argument(
-                "--period", type=float, default=0.001, metavar="S", help="the loop's period (default 0.001)"
-            ),
-            argument(
+            option("--out", "MODEL", "the model file"),
+            switch("--replace", "overwrite MODEL"),
+            option("--rig", "NAME", "name of the rig (default simulated)", default="simulated"),
+            option("--points", "FILE", "rig file or points file with the points (default: the paper's)"),
+            option("--period", "S", "the loop's period (default 0.001)", type=float, default=0.001),
+            option(
                 "--sensor-period",
+                "S",
+                "the thermocouple's sampling period (default 0.1)",
                 type=float,
                 default=0.1,
-                metavar="S",
-                help="the thermocouple's sampling period (default 0.1)",
             ),
             argument(
                 "--kind",
@@ -38,12 +30,12 @@ TABLE: Table = {
                 default="kalman",
                 help="steady Kalman gain (default), or the paper's modified Kalman filter",
             ),
-            argument(
+            option(
                 "--heat-density",
+                "Q",
+                "spectral density of each body's unknown heat, W^2 s (default 0.05)",
                 type=float,
                 default=0.05,
-                metavar="Q",
-                help="spectral density of each body's unknown heat, W^2 s (default 0.05)",
             ),
         ),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import MODEL, READING, Table, argument, command
+from thermoctl.command import MODEL, READING, Table, argument, command, option
 
 TABLE: Table = {
     MODEL: (
@@ -12,25 +12,19 @@ TABLE: Table = {
             "thermoctl.plant.first.new:new",
             "",
             argument("file", metavar="FILE", help="the plant file to write"),
-            argument(
+            option(
                 "--from-csv",
-                metavar="REC",
-                help="a recording: of a thermal rig, an axis or tanks; guesses are marked `# confirm`",
+                "REC",
+                "a recording: of a thermal rig, an axis or tanks; guesses are marked `# confirm`",
             ),
-            argument(
+            option(
                 "--inputs",
-                metavar="A,B",
-                help="columns of inputs, with units where the file has none: 'P [W],air [degC]'; '' for none (default: by kind)",
+                "A,B",
+                "columns of inputs, with units where the file has none: 'P [W],air [degC]'; '' for none (default: by kind)",
             ),
-            argument(
-                "--outputs", metavar="A,B", help="columns of sensors, in the same way (default: by kind)"
-            ),
+            option("--outputs", "A,B", "columns of sensors, in the same way (default: by kind)"),
             *READING,
-            argument(
-                "--template",
-                metavar="NAME",
-                help="block, motor, hot-end, room, tank, stage, flexure or actuator",
-            ),
+            option("--template", "NAME", "block, motor, hot-end, room, tank, stage, flexure or actuator"),
         ),
         command(
             "plant show",
@@ -38,7 +32,7 @@ TABLE: Table = {
             "thermoctl.plant.commands:show",
             "",
             argument("plant", metavar="PLANT"),
-            argument("--out", metavar="FILE", help="draw to FILE.svg or FILE.png instead"),
+            option("--out", "FILE", "draw to FILE.svg or FILE.png instead"),
         ),
     )
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoctl.command import FORMATS, JSON, LOOK, READING, Table, argument, command
+from thermoctl.command import FORMATS, JSON, LOOK, READING, Table, argument, command, option, switch
 
 TABLE: Table = {
     LOOK: (
@@ -30,10 +30,8 @@ TABLE: Table = {
             argument("file", help="any recording"),
             argument("out", help="OUT.parquet, .csv, .mf4, .mcap"),
             argument("--columns", help="only these signals, separated by commas"),
-            argument(
-                "--from", dest="begin", type=float, default=float("-inf"), metavar="S", help="from this t"
-            ),
-            argument("--to", dest="end", type=float, default=float("inf"), metavar="S", help="before this t"),
+            option("--from", "S", "from this t", dest="begin", type=float, default=float("-inf")),
+            option("--to", "S", "before this t", dest="end", type=float, default=float("inf")),
         ),
         command(
             "recordings import",
@@ -41,8 +39,8 @@ TABLE: Table = {
             "thermoctl.recording.commands:import_recordings",
             "",
             argument("files", nargs="+", metavar="FILE", help=FORMATS),
-            argument("--out", metavar="OUT", help="OUT.parquet (or .csv, .arrow: without units)"),
-            argument("--explain", action="store_true", help="say how each file is read, and why"),
+            option("--out", "OUT", "OUT.parquet (or .csv, .arrow: without units)"),
+            switch("--explain", "say how each file is read, and why"),
             *READING,
         ),
         command(
