@@ -143,19 +143,9 @@ def read_cia402(top: Section, folder: Path) -> Cia402:
     transmit = tuple(read_object_name(n, "transmit") for n in k["transmit"])
     if not transmit or transmit[0] != STATUS_WORD:
         raise s.get("transmit").error("transmit: the objects of TPDO 1, the status word '0x6041' first")
-    spec = Cia402(
-        eds,
-        k["node_id"],
-        k["mode"],
-        read_object_name(k["command"], "command"),
-        transmit,
-        k["master_id"],
-        k["heartbeat_s"],
-        k["watchdog_s"],
-        tuple(read_start_up(node) for node in k["start_up"] or ()),
-        k["sdo_timeout_s"],
-        read_objects(k["objects"]),
-    )
+    k |= {"eds": eds, "transmit": transmit, "command": read_object_name(k["command"], "command")}
+    k["start_up"] = tuple(read_start_up(node) for node in k["start_up"] or ())
+    spec = Cia402(**{**k, "objects": read_objects(k["objects"])})
     if spec.watchdog_s < 2 * spec.heartbeat_s:
         raise s.node.error(
             f"watchdog_s: {spec.watchdog_s:g} s is below two heartbeats of {spec.heartbeat_s:g} s: "

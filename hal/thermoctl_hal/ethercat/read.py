@@ -89,7 +89,7 @@ def read_ethercat(top: Section, _folder: Path) -> Ethercat:
     """Read `ethercat`, the description of a slave. Raises InputError."""
     s = top.section("ethercat")
     k = take(s, ETHERCAT["ethercat"])
-    types = STANDARD_TYPES | read_objects(k["objects"])
+    types = STANDARD_TYPES | read_objects(k.pop("objects"))
     transmit = {}
     for node in k["transmit"] or ():
         item = read_object_name(node, "transmit")
@@ -102,20 +102,11 @@ def read_ethercat(top: Section, _folder: Path) -> Ethercat:
             raise k["command"].error(f"command: object {object_name(item)} has no sign")
         if next(iter(transmit), None) != STATUS_WORD:
             raise s.node.error("transmit: a drive sends its status word 0x6041 first")
-    spec = Ethercat(
-        k["vendor_id"],
-        k["product_code"],
-        k["position"],
-        k["input_bytes"],
-        transmit,
-        command,
-        k["mode"],
-        tuple(_start_up(node, types) for node in k["start_up"] or ()),
-        _watchdog(s, k),
-        k["timeout_s"],
-    )
+    watchdog_s = _watchdog(s, k)
+    start_up = tuple(_start_up(node, types) for node in k["start_up"] or ())
     s.end()
-    return spec
+    k |= {"transmit": transmit, "command": command, "watchdog_s": watchdog_s, "start_up": start_up}
+    return Ethercat(**k)
 
 
 def _watchdog(s: Section, k: dict[str, Any]) -> float | None:

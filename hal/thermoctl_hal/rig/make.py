@@ -105,21 +105,22 @@ def make_devices(settings: Settings) -> list[Device]:
     """Make the drivers of `hal.devices`, not connected. Raises InputError.
 
     Paths of profiles are relative to the configuration file."""
-    return [driver(b) for b in check_rig(_bindings(settings))]
+    return [driver(b) for b in check_rig(bindings(settings))]
 
 
-def _bindings(settings: Settings) -> list[Binding]:
+def bindings(settings: Settings) -> list[Binding]:
+    """Return each item of `hal.devices`, bound to its profile. Raises InputError."""
     return [bind(node, Path(settings.path).parent, settings.channels) for node in settings.hal.devices]
 
 
 def device_notes(settings: Settings) -> list[str]:
     """Return a line for each probable mistake in `hal.devices`. Raises InputError."""
-    bindings = _bindings(settings)
+    bound = bindings(settings)
     limit = settings.control.output_limit
-    return rig_notes(bindings) + [
+    return rig_notes(bound) + [
         f"{b.place}: control.output_limit is {limit:g}, but {b.name} takes commands of {low:g} .. {high:g} "
         "(drive.limits): the rest is cut off, and drive_saturated does not see it; lower output_limit"
-        for b in bindings
+        for b in bound
         if b.profile.amplifier
         for low, high in (b.profile.amplifier.limits,)
         if limit > max(-low, high)
@@ -128,14 +129,14 @@ def device_notes(settings: Settings) -> list[str]:
 
 def device_warnings(settings: Settings) -> list[str]:
     """Return a line for each file of a device that was read in spite of a fault. Raises InputError."""
-    return file_warnings(_bindings(settings)) if settings.hal.backend == "devices" else []
+    return file_warnings(bindings(settings)) if settings.hal.backend == "devices" else []
 
 
 def whole_frames(settings: Settings) -> dict[str, str]:
     """Return role -> device, for devices that send all their channels in each frame or line."""
     return {
         x.role: b.name
-        for b in _bindings(settings)
+        for b in bindings(settings)
         if b.profile.bus in ("serial-binary", "serial-lines", "can-cia402")
         or len({getattr(x.channel.source, "message", x.role) for x in b.bounds}) == 1
         and b.profile.bus == "can-dbc"

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 from thermoctl.configuration.settings import AXES, Settings
 from thermoctl.files.yamlfile import Node, load
 from thermoctl_hal.base.binding import Bound
-from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.make import bindings
 
 PLACEHOLDER = re.compile(r"X{4,}|Y{4,}|<[^>]*>")
 """Text of a template's port that stands for the user's own."""
 SIMULATED = ("amplifier_state", "amplifier_fault")
 """Roles that the simulated amplifier gives besides the plant's outputs."""
-
-
-def bounds(settings: Settings) -> list[Bound]:
-    """Return the channels that devices give, each in its role. Raises InputError."""
-    folder = Path(settings.path).parent
-    return [b for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds]
 
 
 def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
@@ -30,15 +23,11 @@ def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
     InputError."""
     protection, period_s = settings.protection, settings.loop.period_s
     if protection.late_s <= period_s:
-        yield (
-            True,
-            _at(
-                settings,
-                ("protection", "late_s"),
-                f"protection.late_s: {protection.late_s:g} s is not longer than loop.period_s ({period_s:g} s): every tick "
-                "is late; write at least 3 periods",
-            ),
+        late = (
+            f"protection.late_s: {protection.late_s:g} s is not longer than loop.period_s ({period_s:g} s): every tick "
+            "is late; write at least 3 periods"
         )
+        yield True, _at(settings, ("protection", "late_s"), late)
     if settings.hal.backend == "simulated":
         from thermoctl_hal.simulated.rig import make_rig  # loads the plant's packages
 
@@ -48,15 +37,9 @@ def obstacles(settings: Settings) -> Iterator[tuple[bool, str]]:
     for node in settings.hal.devices:
         port = node.value.get("port")
         if port is not None and (placeholder := PLACEHOLDER.search(str(port.value))):
-            yield (
-                True,
-                str(
-                    port.error(
-                        f"port: '{placeholder[0]}' stands for your own adapter; `ls /dev/serial/by-id` shows its name"
-                    )
-                ),
-            )
-    bound = bounds(settings)
+            stands = f"'{placeholder[0]}' stands for your own adapter; `ls /dev/serial/by-id` shows its name"
+            yield True, str(port.error(f"port: {stands}"))
+    bound = [b for device in bindings(settings) for b in device.bounds]
     yield from _unbound(settings, {b.role for b in bound}, "device of hal.devices")
     for b in bound:
         yield from ((b.role in protection.required, line) for line in _never_valid(settings, b))
@@ -71,16 +54,12 @@ def _unbound(settings: Settings, given: set[str], giver: str) -> Iterator[tuple[
     place = _place(settings, ("protection", "required"))
     default = "" if isinstance(place.value, list) else " (the default)"
     left = ", ".join(role for role in required if role in given)
-    yield (
-        True,
-        str(
-            place.error(
-                f"protection.required names {', '.join(missing)}{default}, but no {giver} has "
-                f"{'this role' if len(missing) == 1 else 'these roles'}: the rig could never be armed; bind one, or, where "
-                f"none is fitted, write required: [{left}]"
-            )
-        ),
+    what = (
+        f"protection.required names {', '.join(missing)}{default}, but no {giver} has "
+        f"{'this role' if len(missing) == 1 else 'these roles'}: the rig could never be armed; bind one, or, where "
+        f"none is fitted, write required: [{left}]"
     )
+    yield True, str(place.error(what))
 
 
 def _never_valid(settings: Settings, b: Bound) -> Iterator[str]:

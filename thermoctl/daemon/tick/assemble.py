@@ -14,7 +14,7 @@ from thermoctl.configuration.settings import RigSettings, Settings
 from thermoctl.control.model import BY_CHANNEL, CompensatorModel, Parameters, zero_model
 from thermoctl.files.yamlfile import InputError, load
 from thermoctl.rig.channels import Channels
-from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.make import bindings
 
 UNNAMED = RigSettings().name
 PLANT_FILES = (".yaml", ".yml", ".fmu")
@@ -84,8 +84,7 @@ def power_warning(settings: Settings) -> str:
     protection = settings.protection
     if settings.hal.backend != "devices":
         return ""
-    folder = Path(settings.path).parent
-    roles = {b.role for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds}
+    roles = given_roles(settings)
     lacks = [] if "current_a" in roles else ["current_a"]
     if "voltage_v" not in roles and protection.resistance_ohm == 0.0:
         lacks.append("voltage_v (or protection.resistance_ohm, for R I^2)")
@@ -103,6 +102,11 @@ def power_warning(settings: Settings) -> str:
     )
 
 
+def given_roles(settings: Settings) -> set[str]:
+    """Return the roles that devices have. Raises InputError."""
+    return {b.role for device in bindings(settings) for b in device.bounds}
+
+
 def lacks(settings: Settings) -> list[str]:
     """Return a line for each sensor that this rig has not, with the consequence.
 
@@ -110,8 +114,7 @@ def lacks(settings: Settings) -> list[str]:
     the air or the coil: there is nothing to start its estimates from."""
     if settings.hal.backend != "devices":
         return []
-    folder, coil = Path(settings.path).parent, settings.channels.coil
-    roles = {b.role for node in settings.hal.devices for b in bind(node, folder, settings.channels).bounds}
+    coil, roles = settings.channels.coil, given_roles(settings)
     electric = {"voltage_v", "current_a"} <= roles and settings.protection.resistance_ohm > 0.0
     by_resistance = electric and coil not in roles and coil not in settings.protection.required
     lines = []
@@ -148,14 +151,14 @@ def check_mode(settings: Settings) -> None:
     """Check that the drive takes a target position, um, only with control.mode: position.
 
     Raises InputError."""
-    folder, wanted = Path(settings.path).parent, settings.control.mode == "position"
-    for node in settings.hal.devices if settings.hal.backend == "devices" else ():
-        profile = bind(node, folder, settings.channels).profile
+    wanted = settings.control.mode == "position"
+    for b in bindings(settings) if settings.hal.backend == "devices" else ():
+        profile = b.profile
         if profile.amplifier is None or (profile.amplifier.unit == "um") == wanted:
             continue
         expected = "torque (or velocity)" if wanted else "position"
         raise InputError(
-            f"{node.place}: the drive of {profile.model} takes its command in {profile.amplifier.unit}, and control.mode is "
+            f"{b.place}: the drive of {profile.model} takes its command in {profile.amplifier.unit}, and control.mode is "
             f"{settings.control.mode}: set control.mode: {expected}, or take a profile whose drive has "
             f"unit {'um' if wanted else 'of a current, voltage or speed'}"
         )
