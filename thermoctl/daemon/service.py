@@ -177,17 +177,10 @@ class Background(subprocess.Popen[bytes]):
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as out:
             self.began = out.tell()
+            # -P: a folder `thermoctl` in the working directory must not hide the installed package
+            program = [sys.executable, "-P", "-m", "thermoctl.cli", "run", "--config"]
             super().__init__(
-                # -P: a folder `thermoctl` in the working directory must not hide the installed package
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "thermoctl.cli",
-                    "run",
-                    "--config",
-                    str(Path(settings.path).absolute()),
-                ],
+                [*program, str(Path(settings.path).absolute())],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=out,

@@ -15,17 +15,8 @@ from typing import Any
 from thermoctl.plant.expression import Expr
 
 FORMAT = "thermoctl-plant/1"
-ROLES = (
-    "ambient",
-    "temperature",
-    "position",
-    "velocity",
-    "current",
-    "voltage",
-    "setpoint",
-    "level",
-    "time_of_day",
-)
+_ROLES = "ambient temperature position velocity current voltage setpoint level time_of_day"
+ROLES = tuple(_ROLES.split())
 """Kinds of quantities, for units that fit several kinds."""
 FLICKER_DECADES = 4  # range of a 1/f part: 20 000 samples reach from 1 / length to half the sampling rate
 

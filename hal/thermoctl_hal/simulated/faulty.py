@@ -31,21 +31,8 @@ from thermoctl.files.yamlfile import Node, Section, suggest
 from thermoctl.rig.channels import AT, DEFAULT, Channels
 from thermoctl_hal.base.backend import ABSENT, ERROR, OK, STALE, Backend, Sample
 
-KINDS = (
-    "drop",
-    "delay",
-    "duplicate",
-    "corrupt",
-    "freeze",
-    "nan",
-    "step",
-    "drift",
-    "set",
-    "swap",
-    "error",
-    "disconnect",
-    "stuck",
-)
+_KINDS = "drop delay duplicate corrupt freeze nan step drift set swap error disconnect stuck"
+KINDS = tuple(_KINDS.split())
 SWAPPED = 2  # roles of a swap
 MAX_DELAYED = 100_000  # readings of one role that wait for their delay
 

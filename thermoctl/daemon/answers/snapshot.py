@@ -14,29 +14,12 @@ from thermoctl.daemon.unsaved import unsaved
 from thermoctl.rig.channels import STATUS_NAMES
 from thermoctl.rig.signals import AT, Row
 
-NUMBERS = (
-    "setpoint_um",
-    "reference_um",
-    "position_um",
-    "compensated_um",
-    "compensation_um",
-    "expansion_um",
-    "output_reference_um",
-    "control_v",
-    "drive",
-    "enable",
-    "voltage_v",
-    "current_a",
-    "power_w",
-    "air_c",
-    "innovation_c",
-    "kalman_gain",
-    "position_age_s",
-    "coil_age_s",
-    "supply_v",
-    "amplifier_state",
-    "amplifier_fault",
-)
+_NUMBERS = """
+setpoint_um reference_um position_um compensated_um compensation_um expansion_um output_reference_um
+control_v drive enable voltage_v current_a power_w air_c innovation_c kalman_gain position_age_s coil_age_s
+supply_v amplifier_state amplifier_fault
+"""
+NUMBERS = tuple(_NUMBERS.split())
 """Signals that a status answer contains under their own names."""
 
 

@@ -66,52 +66,30 @@ def _lines(families: Iterable[Family]) -> Iterator[str]:
 def _state_families(row: np.ndarray, found: Mapping[str, Mapping[str, Any]], layout: Row) -> Iterator[Family]:
     """Yield state, faults, readings and temperatures."""
     state, bits = int(row[AT["state"]]), fault_word(row)
-    yield (
-        "thermoctl_state",
-        "gauge",
-        "1 for the state the daemon is in",
-        [(f'{{state="{name}"}}', float(k == state)) for k, name in enumerate(arming.STATES)],
-    )
-    yield (
-        "thermoctl_fault",
-        "gauge",
-        "1 while the fault is active",
-        [(f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS],
-    )
+    states = [(f'{{state="{name}"}}', float(k == state)) for k, name in enumerate(arming.STATES)]
+    yield "thermoctl_state", "gauge", "1 for the state the daemon is in", states
+    active = [
+        (f'{{name="{f.name}",severity="{f.severity}"}}', float(bits >> f.bit & 1)) for f in faults.FAULTS
+    ]
+    yield "thermoctl_fault", "gauge", "1 while the fault is active", active
     fitted = {role: r for role, r in found.items() if r["state"] != "ABSENT"}
-    yield (
-        "thermoctl_reading_ok",
-        "gauge",
-        "1 while the role's reading is valid",
-        [(f'{{role="{role}"}}', float(r["state"] == "OK")) for role, r in fitted.items()],
-    )
-    yield (
-        "thermoctl_reading_age_seconds",
-        "gauge",
-        "time since the role's newest reading",
-        [(f'{{role="{role}"}}', r["age_s"]) for role, r in fitted.items()],
-    )
-    yield (
-        "thermoctl_temperature_celsius",
-        "gauge",
-        "temperature of a point",
-        [
-            (f'{{point="{p}",kind="{kind}"}}', row[layout.index[f"{p}{end}"]])
-            for p in layout.channels.point_names
-            for kind, end in (("measured", "_c"), ("estimated", "_est_c"))
-        ],
-    )
+    good = [(f'{{role="{role}"}}', float(r["state"] == "OK")) for role, r in fitted.items()]
+    yield "thermoctl_reading_ok", "gauge", "1 while the role's reading is valid", good
+    ages = [(f'{{role="{role}"}}', r["age_s"]) for role, r in fitted.items()]
+    yield "thermoctl_reading_age_seconds", "gauge", "time since the role's newest reading", ages
+    temperatures = [
+        (f'{{point="{p}",kind="{kind}"}}', row[layout.index[f"{p}{end}"]])
+        for p in layout.channels.point_names
+        for kind, end in (("measured", "_c"), ("estimated", "_est_c"))
+    ]
+    yield "thermoctl_temperature_celsius", "gauge", "temperature of a point", temperatures
 
 
 def _signal_families(row: np.ndarray, layout: Row) -> Iterator[Family]:
     """Yield the start time, and every signal that no other family holds."""
     start_s = row[AT["wall_s"]] - row[AT["t_s"]]
-    yield (
-        "thermoctl_start_time_seconds",
-        "gauge",
-        "when the daemon started, seconds since 1970",
-        [("", start_s)],
-    )
+    began = "when the daemon started, seconds since 1970"
+    yield "thermoctl_start_time_seconds", "gauge", began, [("", start_s)]
     temperatures = {f"{p}{end}" for p in layout.channels.point_names for end in ("_c", "_est_c")}
     for s in layout.signals:
         if s.name in _COUNTERS:

@@ -36,26 +36,13 @@ BEFORE_S, AFTER_S = 2.0, 2.0  # span of a capture before and after the fault
 CAPTURES = 16
 SILENT_S = 2.0  # rows are shown as old after this time without a tick
 PAST_S, PAST_STEP_S = 60.0, 0.1  # length and step of the history sent to a newly opened page
-PAST = (
-    "wall_s",
-    "reference_um",
-    "compensated_um",
-    "position_raw_um",
-    "output_reference_um",
-    "compensation_um",
-    "expansion_um",
-    "innovation_c",
-    "power_w",
-)
-RANGED = (
-    "position_raw_um",
-    "compensated_um",
-    "output_reference_um",
-    "lateness_us",
-    "drive",
-    "power_w",
-    "innovation_c",
-)
+_PAST = """
+wall_s reference_um compensated_um position_raw_um output_reference_um compensation_um expansion_um
+innovation_c power_w
+"""
+PAST = tuple(_PAST.split())
+_RANGED = "position_raw_um compensated_um output_reference_um lateness_us drive power_w innovation_c"
+RANGED = tuple(_RANGED.split())
 """Signals whose minimum and maximum since the previous frame are in each frame."""
 LATENESS_EDGES_US = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 

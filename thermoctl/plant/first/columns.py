@@ -90,27 +90,11 @@ _AIR = (  # names of surroundings, the outermost first: the room of a building i
     "room raum salle sala stanza zimmer kamer rum pokoj lab labor halle hall habitacion troom traum",
 )
 _AIR_STEMS = ("outdoor aussen exterieur", "ambient umgebung omgeving environ otocze entorn", "luft", "raum")
-_SUFFIX = {
-    "c": "degC",
-    "degc": "degC",
-    "k": "K",
-    "w": "W",
-    "kw": "kW",
-    "mw": "mW",
-    "a": "A",
-    "ma": "mA",
-    "v": "V",
-}
-_SUFFIX |= {
-    "mv": "mV",
-    "n": "N",
-    "mm": "mm",
-    "um": "um",
-    "pct": "%",
-    "lpm": "l/min",
-    "celsius": "degC",
-    "watts": "W",
-}
+_ENDS = (  # units, each with the ends of names that mean it
+    "degC c degc celsius | K k | W w watts | kW kw | mW mw | A a | mA ma | V v | mV mv | N n | mm mm | um um | "
+    "% pct | l/min lpm"
+)
+_SUFFIX = {end: unit for unit, *ends in map(str.split, _ENDS.split("|")) for end in ends}
 
 
 _PLAIN = str.maketrans("øłØŁ", "olOL") | str.maketrans({"ß": "ss", "θ": " theta "})
