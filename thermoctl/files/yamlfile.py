@@ -172,14 +172,8 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
         return Node(out, file, line, column)
     if isinstance(node, yaml.SequenceNode):
         return Node([_convert(v, loader, file, depth + 1) for v in node.value], file, line, column)
-    if node.tag.startswith("tag:yaml.org,2002:") and node.tag.rsplit(":", 1)[1] in (
-        "str",
-        "int",
-        "float",
-        "bool",
-        "null",
-    ):
-        kind = node.tag.rsplit(":", 1)[1]
+    standard, _, kind = node.tag.rpartition(":")
+    if standard == "tag:yaml.org,2002" and kind in ("str", "int", "float", "bool", "null"):
         try:
             if kind == "int":
                 return Node(int(node.value.replace("_", "")), file, line, column)

@@ -20,19 +20,8 @@ import numpy as np
 
 from thermoctl.plant.native.fmu import opened
 
-FUNCTIONS = {
-    "abs": 1,
-    "sign": 1,
-    "sqrt": 1,
-    "exp": 1,
-    "log": 1,
-    "sin": 1,
-    "cos": 1,
-    "tanh": 1,
-    "min": 2,
-    "max": 2,
-    "step": 1,
-}
+_NAMES = "abs sign sqrt exp log sin cos tanh min max step"
+FUNCTIONS = {f: 2 if f in ("min", "max") else 1 for f in _NAMES.split()}  # number of arguments by name
 SPECIAL = ("table", "delay", "first", "fmu")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 MAX_LENGTH, MAX_DEPTH, MAX_TOKENS = 20_000, 80, 5_000

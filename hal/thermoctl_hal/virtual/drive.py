@@ -11,19 +11,13 @@ import math
 import struct
 from dataclasses import dataclass, field
 
-from thermoctl_hal.base.wire import EXTENDED
+from thermoctl_hal.base.wire import EXTENDED, encode_slcan
 
 NOT_READY, DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 BOOT, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 HEARTBEAT_LOST = 0x8130
-ABORT_NO_OBJECT, ABORT_NO_SUB, ABORT_READ_ONLY, ABORT_LENGTH, ABORT_COMMAND, ABORT_VALUE = (
-    0x06020000,
-    0x06090011,
-    0x06010002,
-    0x06070010,
-    0x05040001,
-    0x06090030,
-)
+ABORT_NO_OBJECT, ABORT_NO_SUB, ABORT_READ_ONLY = 0x06020000, 0x06090011, 0x06010002
+ABORT_LENGTH, ABORT_COMMAND, ABORT_VALUE = 0x06070010, 0x05040001, 0x06090030
 Frame = tuple[int, bytes]
 
 
@@ -321,10 +315,4 @@ class SlcanAdapter:
 
     def encode(self, frames: list[Frame]) -> bytes:
         """Encode frames from the bus for the host; none while the channel is closed."""
-        if not self.open:
-            return b""
-        return b"".join(
-            (b"T%08X" % (i & ~EXTENDED) if i & EXTENDED else b"t%03X" % i)
-            + b"%d%s\r" % (len(d), d.hex().upper().encode())
-            for i, d in frames
-        )
+        return b"".join(encode_slcan(*frame) for frame in frames) if self.open else b""
