@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from thermoctl import __version__
-from thermoctl.export.text import Notation, unique, written
+from thermoctl.export.text import Notation, net_flow, unique, written
 from thermoctl.export.values import Values, first_outputs
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Plant
@@ -103,11 +103,8 @@ def modelica_source(plant: Plant, numbers: Values, model: str) -> str:
     start = [f"  {names[n.name]} = {text(n.initial)};" for n in plant.nodes.values()]
     equations = [f"  {names[f'flow {f.name}']} = {text(f.rate)};" for f in plant.flows.values()]
     for n in plant.nodes.values():
-        parts = [f"+ {names[f'flow {f.name}']}" for f in plant.flows.values() if f.target == n.name]
-        parts += [f"- {names[f'flow {f.name}']}" for f in plant.flows.values() if f.source == n.name]
-        equations.append(
-            f"  ({text(n.storage)}) * der({names[n.name]}) = {' '.join(parts).removeprefix('+ ')};"
-        )
+        net = net_flow(plant, n.name, names)
+        equations.append(f"  ({text(n.storage)}) * der({names[n.name]}) = {net};")
     equations += [f"  {names[f'output {o.name}']} = {text(o.value)};" for o in plant.outputs.values()]
     body = "\n".join(equations)
     title = (plant.title or plant.file).replace('"', "'")

@@ -6,7 +6,7 @@ import keyword
 from collections.abc import Sequence
 
 from thermoctl import __version__
-from thermoctl.export.text import Notation, unique, written
+from thermoctl.export.text import Notation, net_flow, unique, written
 from thermoctl.export.values import Values, first_outputs
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
@@ -66,9 +66,7 @@ def python_source(plant: Plant, numbers: Values) -> str:
     )
     slopes = []
     for n in plant.nodes.values():
-        parts = [f"+ {known[f'flow {f.name}']}" for f in plant.flows.values() if f.target == n.name]
-        parts += [f"- {known[f'flow {f.name}']}" for f in plant.flows.values() if f.source == n.name]
-        net, storage = " ".join(parts).removeprefix("+ "), text(n.storage)
+        net, storage = net_flow(plant, n.name, known), text(n.storage)
         slopes.append(f"({net}) / ({storage})" if storage != "1" else net)
     arrays = {
         "slopes": _rows(slopes, list(e.states), ""),

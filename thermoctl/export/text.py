@@ -83,6 +83,13 @@ def written(
     return text(e, 0)
 
 
+def net_flow(plant: Plant, node: str, names: Mapping[str, str]) -> str:
+    """Return the sum of the flows into a node less those from it; `names`: those of `unique`."""
+    parts = [f"+ {names[f'flow {f.name}']}" for f in plant.flows.values() if f.target == node]
+    parts += [f"- {names[f'flow {f.name}']}" for f in plant.flows.values() if f.source == node]
+    return " ".join(parts).removeprefix("+ ")
+
+
 def unique(plant: Plant, reserved: Collection[str], flow: str = "flow_{}") -> dict[str, str]:
     """Return a name of each quantity and flow that no keyword and no other name is.
 

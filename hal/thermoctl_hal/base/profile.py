@@ -22,18 +22,8 @@ if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Database
 
 T = TypeVar("T")
-FIELD_TYPES = {
-    "int8": "b",
-    "uint8": "B",
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
+_TYPES = "int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
+FIELD_TYPES = dict(zip(_TYPES.split(), "bBhHiIqQfd", strict=True))
 """Types of numbers in frames and registers, and their letters in `struct`."""
 FRAME_TYPES: dict[str, tuple[str, int]] = {
     **{f"int{8 * n}": ("int", n) for n in range(1, 9)},

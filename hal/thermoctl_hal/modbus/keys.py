@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from thermoctl_hal.base.key import Key, bits_of, flag, listed, node, number, section, text, whole
 
-MAX_ADDRESS, MAX_MODBUS_BITS = 65535, 64
+MAX_ADDRESS = 65535
+_KINDS, _ORDERS = ("input", "holding", "discrete", "coil"), ("big", "little")
 
 MODBUS: dict[str, tuple[Key, ...]] = {
     "modbus": (
@@ -14,12 +15,7 @@ MODBUS: dict[str, tuple[Key, ...]] = {
         whole("max_block", "registers read by one request, at most", 1, 125, default=100),
     ),
     "channel of modbus": (
-        text(
-            "kind",
-            "input (function 4), holding (3), discrete (2) or coil (1)",
-            "input",
-            choices=("input", "holding", "discrete", "coil"),
-        ),
+        text("kind", "input (function 4), holding (3), discrete (2) or coil (1)", "input", choices=_KINDS),
         whole(
             "register",
             "address from 0: a manual's 40001 is kind: holding, register: 0",
@@ -32,9 +28,9 @@ MODBUS: dict[str, tuple[Key, ...]] = {
             "word_order",
             "order of the words of a value: big is a manual's ABCD, little CDAB; with byte_order little BADC, DCBA",
             "big",
-            choices=("big", "little"),
+            choices=_ORDERS,
         ),
-        text("byte_order", "order of the two bytes of a word", "big", choices=("big", "little")),
+        text("byte_order", "order of the two bytes of a word", "big", choices=_ORDERS),
         *bits_of("the register"),
         flag("signed", "the bits are a two's complement", False),
         listed(
@@ -54,7 +50,7 @@ MODBUS: dict[str, tuple[Key, ...]] = {
         section("invalid", "a register or bit that says that the reading is wrong (open wire)", None),
     ),
     "invalid of modbus": (
-        text("kind", "as of a channel", "input", choices=("input", "holding", "discrete", "coil")),
+        text("kind", "as of a channel", "input", choices=_KINDS),
         whole("register", "address from 0", 0, MAX_ADDRESS, example="120"),
         whole("mask", "bits of the register that are looked at", 1, 0xFFFF, default=0xFFFF, example="0x0300"),
         whole("good", "their value when the reading is good", 0, 0xFFFF, default=0),
@@ -63,7 +59,7 @@ MODBUS: dict[str, tuple[Key, ...]] = {
         text("kind", "holding or coil", "holding", choices=("holding", "coil")),
         whole("register", "address from 0", 0, MAX_ADDRESS),
         text("type", "as of a channel", "int16"),
-        text("word_order", "order of the words", "big", choices=("big", "little")),
+        text("word_order", "order of the words", "big", choices=_ORDERS),
         node("value", "the number written, or `command`"),
         whole(
             "function", "6 or 16 for registers, 5 for coils; 0: by the number of registers", 0, 16, default=0
