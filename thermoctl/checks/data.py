@@ -75,16 +75,12 @@ def _gaps(model: Model, table: Table, excitation: Excitation) -> list[Finding]:
     changed = [i.column for i in held if np.any(u[i.name][long] != u[i.name][long + 1])]
     unknown = f"; {', '.join(map(repr, changed))} changed meanwhile" if changed else ""
     more = f" and {len(long) - 1} more" if len(long) > 1 else ""
-    return [
-        Finding(
-            "gap",
-            table.path,
-            f"no samples from t = {table.t[k]:.6g} to {table.t[k + 1]:.6g} s{more}; they are "
-            f"{np.median(steps):.3g} s apart elsewhere{unknown}",
-            "The inputs are unknown there: cut the recording at the gap and give both parts.",
-            severe=bool(changed),
-        )
-    ]
+    what = (
+        f"no samples from t = {table.t[k]:.6g} to {table.t[k + 1]:.6g} s{more}; they are "
+        f"{np.median(steps):.3g} s apart elsewhere{unknown}"
+    )
+    advice = "The inputs are unknown there: cut the recording at the gap and give both parts."
+    return [Finding("gap", table.path, what, advice, severe=bool(changed))]
 
 
 def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarray) -> list[Finding]:
@@ -107,16 +103,14 @@ def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarra
     if 0.5 * float(np.sum(moved**2)) <= -log(ALARM):
         return []
     names = ", ".join(f"'{i.name}'" for i in loose)
-    return [
-        Finding(
-            "between",
-            table.path,
-            f"no word on how an input goes on between rows, where it changes in most of them: {names}. It is held; straight "
-            f"lines would move the readings by up to {np.abs(moved).max():.2g} times their noise",
-            "State between_samples in the plant file: linear for what is measured, hold for what a drive holds.",
-            severe=False,
-        )
-    ]
+    what = (
+        f"no word on how an input goes on between rows, where it changes in most of them: {names}. It is held; straight "
+        f"lines would move the readings by up to {np.abs(moved).max():.2g} times their noise"
+    )
+    advice = (
+        "State between_samples in the plant file: linear for what is measured, hold for what a drive holds."
+    )
+    return [Finding("between", table.path, what, advice, severe=False)]
 
 
 def _quantum(values: np.ndarray) -> float:
@@ -138,16 +132,12 @@ def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
             continue
         every = gcd(*np.diff(jumps).tolist())
         if every > 1 and (len(jumps) - 1) * log(every) > -log(ALARM):
-            return [
-                Finding(
-                    "resampled",
-                    table.path,
-                    f"'{column}' is {how} between every {every}th sample: its {len(values)} values hold "
-                    f"{len(values) // every} readings",
-                    "Leave the cells between two readings empty; else their errors count several times.",
-                    severe=difference > 1,
-                )
-            ]
+            what = (
+                f"'{column}' is {how} between every {every}th sample: its {len(values)} values hold "
+                f"{len(values) // every} readings"
+            )
+            advice = "Leave the cells between two readings empty; else their errors count several times."
+            return [Finding("resampled", table.path, what, advice, severe=difference > 1)]
     return []
 
 
@@ -173,14 +163,9 @@ def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> lis
         key = np.ascontiguousarray(values[k : k + length + 2]).tobytes()
         first = seen.setdefault(key, k)
         if k - first >= length:
-            return [
-                Finding(
-                    "repeated",
-                    table.path,
-                    f"'{column}' from t = {t[k]:.6g} s on repeats its readings from {t[first]:.6g} s, digit for digit",
-                    "Part of the file was copied twice: cut it out.",
-                )
-            ]
+            what = f"'{column}' from t = {t[k]:.6g} s on repeats its readings from {t[first]:.6g} s, digit for digit"
+            advice = "Part of the file was copied twice: cut it out."
+            return [Finding("repeated", table.path, what, advice)]
     return []
 
 
@@ -196,14 +181,11 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             continue
         sd = sds[j]
         if np.ptp(y) == 0 and np.ptp(simulated) > SIGMAS * max(sd, 1e-3 * np.ptp(simulated)):
-            findings.append(
-                Finding(
-                    "still",
-                    table.path,
-                    f"'{o.column}' stands at {y[0]:.6g} throughout; the plant moves it by {np.ptp(simulated):.3g}",
-                    "Is the sensor connected, and is it this column?",
-                )
+            what = (
+                f"'{o.column}' stands at {y[0]:.6g} throughout; the plant moves it by {np.ptp(simulated):.3g}"
             )
+            advice = "Is the sensor connected, and is it this column?"
+            findings.append(Finding("still", table.path, what, advice))
             continue
         findings += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
     scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
@@ -215,14 +197,9 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
     dead = driving and not any(moves(table, i.column) for i in driving)
     if dead and not _follows(excitation.y, run, scales) and not _by_itself(model, excitation, scales):
         names = ", ".join(f"'{i.column}'" for i in driving)
-        findings.append(
-            Finding(
-                "still",
-                table.path,
-                f"no input moves ({names}), but the readings do, far beyond the plant",
-                "Was the right column logged? Without the inputs any effect could be named.",
-            )
-        )
+        what = f"no input moves ({names}), but the readings do, far beyond the plant"
+        advice = "Was the right column logged? Without the inputs any effect could be named."
+        findings.append(Finding("still", table.path, what, advice))
     return findings
 
 
@@ -292,11 +269,6 @@ def _stuck(
     others = np.concatenate([[0.0], steps[: max(a - 1, 0)], steps[b + 1 :]])
     if b < len(y) - 1 and steps[b] <= max(2 * SIGMAS * sd, np.quantile(others, 0.99)):
         return []
-    return [
-        Finding(
-            "stuck",
-            table.path,
-            f"'{column}' stands at {y[a]:.6g} from t = {t[a]:.6g} to {t[b]:.6g} s while the plant moves",
-            "The sensor or its bus hung: empty those cells, or cut the recording.",
-        )
-    ]
+    what = f"'{column}' stands at {y[a]:.6g} from t = {t[a]:.6g} to {t[b]:.6g} s while the plant moves"
+    advice = "The sensor or its bus hung: empty those cells, or cut the recording."
+    return [Finding("stuck", table.path, what, advice)]

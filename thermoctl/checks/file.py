@@ -59,15 +59,11 @@ def _signs(plant: Plant) -> list[Finding]:
     for flow in driving_away(plant):
         if _grows(plant, values) and not _grows(plant, values, flow.name):
             own = next(e for e in (flow.source, flow.target) if e in ex.names(flow.rate))
-            findings.append(
-                Finding(
-                    "sign",
-                    f"{plant.file}:{flow.at}",
-                    f"flow '{flow.name}' grows with '{own}' and drives it further away, so the plant is unstable",
-                    "Is the sign of its rate right, or its 'from' and 'into'?",
-                    severe=False,
-                )
+            what = (
+                f"flow '{flow.name}' grows with '{own}' and drives it further away, so the plant is unstable"
             )
+            advice = "Is the sign of its rate right, or its 'from' and 'into'?"
+            findings.append(Finding("sign", f"{plant.file}:{flow.at}", what, advice, severe=False))
     return findings
 
 
@@ -96,15 +92,9 @@ def _scales(plant: Plant) -> list[Finding]:
         scaled = {q for q in free & frozenset().union(*map(ex.names, exprs)) if _acts(plant, exprs, q)}
         if scaled and not scaled & read and all(_homogeneous(plant, e, scaled) for e in exprs):
             names = ", ".join(sorted(scaled))
-            findings.append(
-                Finding(
-                    "scale",
-                    plant.file,
-                    f"the readings give only ratios of {names}: all of them times one factor change nothing",
-                    "Fix one of them: take its range away, once it is measured or computed.",
-                    severe=False,
-                )
-            )
+            what = f"the readings give only ratios of {names}: all of them times one factor change nothing"
+            advice = "Fix one of them: take its range away, once it is measured or computed."
+            findings.append(Finding("scale", plant.file, what, advice, severe=False))
     return findings
 
 

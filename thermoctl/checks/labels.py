@@ -364,15 +364,11 @@ def _ambient(plant: Plant, tables: Sequence[Table]) -> list[Finding]:
         for unit in ("degF", "K"):
             scale, offset = conversion(unit, "degC")
             if mean > INDOORS[1] and INDOORS[0] <= scale * mean + offset <= INDOORS[1]:
-                findings.append(
-                    Finding(
-                        "unit",
-                        table.path,
-                        f"'{i.column}' is {mean:.4g} degC on average, which would be {scale * mean + offset:.3g} degC "
-                        f"if it is in {unit}",
-                        f"If so: column: {{name: {i.column}, unit: {unit}}}.",
-                        severe=False,
-                    )
+                what = (
+                    f"'{i.column}' is {mean:.4g} degC on average, which would be {scale * mean + offset:.3g} degC "
+                    f"if it is in {unit}"
                 )
+                advice = f"If so: column: {{name: {i.column}, unit: {unit}}}."
+                findings.append(Finding("unit", table.path, what, advice, severe=False))
                 break
     return findings

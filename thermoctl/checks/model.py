@@ -113,18 +113,14 @@ def _stability(model: Model, excitation: Excitation) -> list[Finding]:
         return []
     suspects = [f for f in plant.flows if _growth(jacobian(plant, values, f)) * span <= GROWTH]
     turn = f"Is the sign of the rate of {' or '.join(repr(s) for s in suspects)} right, or its 'from' and 'into'?"
-    return [
-        Finding(
-            "unstable",
-            plant.file,
-            f"the plant is unstable at the start of '{excitation.name}': a deviation doubles every "
-            f"{np.log(2) / growth:.3g} s, and the recording lasts {span:.4g} s",
-            turn
-            if suspects
-            else "An oscillator or a population grows so; else check the signs of its flows.",
-            severe=False,
-        )
-    ]
+    what = (
+        f"the plant is unstable at the start of '{excitation.name}': a deviation doubles every "
+        f"{np.log(2) / growth:.3g} s, and the recording lasts {span:.4g} s"
+    )
+    advice = (
+        turn if suspects else "An oscillator or a population grows so; else check the signs of its flows."
+    )
+    return [Finding("unstable", plant.file, what, advice, severe=False)]
 
 
 def rates_of(model: Model, excitation: Excitation) -> np.ndarray:
@@ -152,15 +148,9 @@ def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
         if none
         else ("Effects of that mode cannot be seen: sample faster, or ")
     )
-    return [
-        Finding(
-            "sampling",
-            excitation.name,
-            f"the samples are {step:.4g} s apart and miss the plant's {seen}",
-            ask + "make that part of the plant static.",
-            severe=False,
-        )
-    ]
+    what = f"the samples are {step:.4g} s apart and miss the plant's {seen}"
+    advice = ask + "make that part of the plant static."
+    return [Finding("sampling", excitation.name, what, advice, severe=False)]
 
 
 def start_errors(model: Model, excitation: Excitation) -> dict[str, tuple[float, float]]:
