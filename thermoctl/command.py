@@ -86,24 +86,16 @@ TIME = option(
     "row to row, such as 0.1s or '10 ms'",
 )
 COLUMNS = option(
-    "--columns",
-    "NAME=COLUMN,...",
-    "names that the plant reads, and the recordings' columns that they stand for",
+    "--columns", "NAME=COLUMN,...", "names that the plant reads, and the recordings' columns for them"
 )
 READING = (
     TIME,
     COLUMNS,
     option("--sheet", "NAME", "the sheet (Excel), group (TDMS) or variable (MATLAB) to read"),
     option(
-        "--missing",
-        "WORD,...",
-        "further words or numbers that mean 'no value', as in --missing=-9999,'not ready'",
+        "--missing", "WORD,...", "further words or numbers for 'no value', as in --missing=-9999,'not ready'"
     ),
-    argument(
-        "--decimal",
-        choices=(".", ","),
-        help="the decimal sign, where a file's numbers can be read in two ways",
-    ),
+    argument("--decimal", choices=(".", ","), help="the decimal sign, where numbers can be read in two ways"),
     option("--run", "N", "of several runs in a file, the one to read, from 1", type=int),
     argument(
         "--equal-times",

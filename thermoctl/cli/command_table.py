@@ -97,11 +97,7 @@ TABLE: Table = {
                 "with --explain: in one line why this effect (NAME, or 'NAME at PLACE') is a finding or none",
             ),
             option(
-                "--last",
-                "N",
-                "with folders: use each rig's newest N recordings (default 2)",
-                type=int,
-                default=2,
+                "--last", "N", "with folders: each rig's newest N recordings (default 2)", type=int, default=2
             ),
             option("--workers", "N", "with folders: local processes (default one a core)", type=int),
             option(

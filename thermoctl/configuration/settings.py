@@ -72,12 +72,7 @@ class LoopSettings:
 
     period_s: float = option("period of the tick", 0.001, "s", 2e-4, 0.1, restart=True)
     cpu: int = option(
-        "number of the processor that runs the loop; -1 leaves the choice to the scheduler",
-        -1,
-        "1",
-        -1,
-        1023,
-        restart=True,
+        "processor that runs the loop; -1 leaves the choice to the scheduler", -1, "1", -1, 1023, restart=True
     )
     priority: int = option(
         "SCHED_FIFO priority of the loop; 0 switches real-time scheduling off", 80, "1", 0, 99, restart=True
@@ -100,9 +95,7 @@ class LoopSettings:
         choices=("clock", "device", "tick"),
     )
     reference: bool = option(
-        "run an idle loop with the same clock beside the control loop; `thermoctl latency` compares both",
-        False,
-        restart=True,
+        "run an idle loop beside the control loop; `thermoctl latency` compares both", False, restart=True
     )
 
 
@@ -127,11 +120,7 @@ class ControlSettings:
         high=1e6,
     )
     setpoint_rate_um_s: float = option(
-        "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
-        1000.0 / 60.0,
-        "um/s",
-        1e-3,
-        1e6,
+        "largest speed towards a new setpoint (default: 1 mm/min)", 1000.0 / 60.0, "um/s", 1e-3, 1e6
     )
     setpoint_low_um: float = option("smallest setpoint that is accepted", -1e6, "um", -1e6, 1e6)
     setpoint_high_um: float = option("largest setpoint that is accepted", 1e6, "um", -1e6, 1e6)
@@ -246,9 +235,7 @@ class HalSettings:
     """The hardware, or its simulation."""
 
     backend: str = option(
-        "where readings come from: a simulated plant, or devices",
-        restart=True,
-        choices=("simulated", "devices"),
+        "source of readings: a simulated plant, or devices", restart=True, choices=("simulated", "devices")
     )
     plant: str = option(
         "plant file of back end `simulated`, relative to this file; the compensator's model assumes this plant",
@@ -263,9 +250,7 @@ class HalSettings:
     )
     drive_input: str = option("name of the plant's input that the amplifier drives", "drive", restart=True)
     inputs: Node | None = option(
-        "course of the other plant inputs: name: {mean, swing, period_s, noise, resolution}",
-        None,
-        restart=True,
+        "course of other plant inputs: name: {mean, swing, period_s, noise, resolution}", None, restart=True
     )
     roles: dict[str, str] = option(
         "channel role of each plant output whose name is not a role: output: role", factory=dict, restart=True
@@ -297,7 +282,7 @@ class SocketSettings:
         restart=True,
     )
     group: str = option(
-        "group whose members may connect and give commands; empty: the group of the daemon's user",
+        "group whose members may connect and give commands; empty: that of the daemon's user",
         "",
         restart=True,
     )

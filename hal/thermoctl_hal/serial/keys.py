@@ -18,12 +18,7 @@ _REQUEST = (
     ),
     number("request_hz", "requests per second", 0, 1000, "Hz", default=0.0, example="20"),
     number(
-        "answer_s",
-        "longest time for an answer, after which the next device of a shared line is asked",
-        1e-3,
-        10,
-        "s",
-        default=0.1,
+        "answer_s", "longest time for an answer; then the next device is asked", 1e-3, 10, "s", default=0.1
     ),
 )
 
@@ -34,19 +29,14 @@ SERIAL: dict[str, tuple[Key, ...]] = {
         text("parity", "none, even or odd", "N", choices=("N", "E", "O")),
         whole("stop_bits", "stop bits", 1, 2, default=1),
         whole(
-            "latency_timer_ms",
-            "longest time that an FTDI adapter holds bytes back; 0 leaves it as it is",
-            0,
-            255,
-            "ms",
-            default=1,
+            "latency_timer_ms", "hold time of an FTDI adapter; 0 leaves it as it is", 0, 255, "ms", default=1
         ),
     ),
     "frame": (
         listed("sync", "0 to 8 bytes that begin a frame; none only with `request`", example="[0xAA, 0x55]"),
         flag(
             "length",
-            "the payload's length follows as one byte. Write another constant length byte into `sync`",
+            "the payload's length follows as one byte; put another constant length into `sync`",
             True,
         ),
         listed("fields", "what the payload holds, in order"),
@@ -78,10 +68,7 @@ SERIAL: dict[str, tuple[Key, ...]] = {
         ),
         text("endian", "byte order, where it differs from the frame's", "", choices=("", *_ENDIAN)),
         whole(
-            "equals",
-            "a frame with another number here is another device's and is ignored",
-            default=None,
-            example="3",
+            "equals", "frames with another number are another device's: ignored", default=None, example="3"
         ),
         text("of", "instead of `type`: this field is some bits of that field", ""),
         *bits_of("that field"),
@@ -113,12 +100,7 @@ SERIAL: dict[str, tuple[Key, ...]] = {
     "channel of serial-lines": (
         text("field", "named group of the pattern"),
         whole("base", "10 or 16; required where the group also takes letters", default=10, example="16"),
-        text(
-            "sign",
-            "group with the sign, where it stands apart from the digits: '-' is minus",
-            "",
-            example="s",
-        ),
+        text("sign", "group with the sign, where it stands apart: '-' is minus", "", example="s"),
         text("unit_field", "group with the unit, where the line gives it", "", example="u"),
         section(
             "unit_factors",
