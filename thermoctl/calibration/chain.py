@@ -72,14 +72,9 @@ def identify(tests: list[Recorded], order: int | None) -> StateSpace:
     round and subtracted. `order` None: selected by BIC in the last round."""
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
-        model = modal.identify(
-            [
-                modal.reduce((t.power_w[:, None], rises(t) - m), 1.0)
-                for t, m in zip(tests, moved, strict=True)
-            ],
-            now,
-            drift_s=DRIFT_S,
-        )
+        pairs = zip(tests, moved, strict=True)
+        records = [modal.reduce((t.power_w[:, None], rises(t) - m), 1.0) for t, m in pairs]
+        model = modal.identify(records, now, drift_s=DRIFT_S)
         if round_ < 2:
             alone = with_air_alone(model)
             moved = [alone.simulate(air_rate(t.air_c)[:, None]) for t in tests]

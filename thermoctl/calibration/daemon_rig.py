@@ -203,12 +203,9 @@ class DaemonRig:
         for path in recording_files(folder, TIER) if folder.is_dir() else ():
             with contextlib.suppress(InputError):
                 rows = rows_of(read_table(path), self.settings.row)
-                parts.append(
-                    rows[
-                        (rows[:, wall] > parts[-1][-1, wall])
-                        & (rows[:, AT["t_s"]] > parts[-1][-1, AT["t_s"]])
-                    ]
-                )
+                newest = parts[-1][-1]
+                is_new = (rows[:, wall] > newest[wall]) & (rows[:, AT["t_s"]] > newest[AT["t_s"]])
+                parts.append(rows[is_new])
                 parts = [p for p in parts if len(p)]
         rows = np.vstack(parts)
         if np.diff(rows[:, wall]).max(initial=0.0) > GAP_S or time.time() - rows[-1, wall] > GAP_S:

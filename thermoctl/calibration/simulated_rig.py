@@ -67,15 +67,10 @@ class SimulatedRig:
             row = simulation.row
             if not ready:
                 raise HardwareError(f"{self.settings.path}: not READY within {READY_S:g} s: {causes(row)}")
+            measured = row[self.settings.row.measured].tolist()
             return {
                 "channels": channel_states(row, self.settings.row),
-                "temperatures_c": dict(
-                    zip(
-                        self.settings.channels.point_names,
-                        row[self.settings.row.measured].tolist(),
-                        strict=True,
-                    )
-                ),
+                "temperatures_c": dict(zip(self.settings.channels.point_names, measured, strict=True)),
                 "compensated_um": float(row[AT["compensated_um"]]),
             }
         finally:

@@ -43,14 +43,8 @@ def _graph(plant: Plant) -> tuple[list[Vertex], list[Edge]]:
     outside: dict[tuple[str, str], list[str]] = {}
     for f in plant.flows.values():
         if f.source and f.target:
-            edges.append(
-                (
-                    index[f.source],
-                    index[f.target],
-                    "flow",
-                    ", ".join(sorted(ex.names(f.rate) & set(plant.parameters))),
-                )
-            )
+            label = ", ".join(sorted(ex.names(f.rate) & set(plant.parameters)))
+            edges.append((index[f.source], index[f.target], "flow", label))
         else:
             outside.setdefault(("in", f.target) if f.target else ("out", f.source or ""), []).append(f.name)
     for (way, node), flows in outside.items():

@@ -242,12 +242,8 @@ class _Demo:
             self.slips.popleft()
         late = status["slips"] - self.slips[0][1]
         if late > 50:
-            lines.append(
-                Text(
-                    f"this machine stalled: {late} ticks skipped in the last second; the rig's time stopped meanwhile",
-                    "yellow",
-                )
-            )
+            stalled = f"this machine stalled: {late} ticks skipped in the last second; the rig's time stopped meanwhile"
+            lines.append(Text(stalled, "yellow"))
         if status["state"] == "FAULT":
             first = status["faults"][0]
             lines.append(Text(f"{first['name']}: {first['meaning']} -> {first['remedy']}", "red"))

@@ -256,16 +256,8 @@ class Watch:
         captured = np.concatenate((*self._recent, rows))
         captured = captured[(captured[:, _T] >= t_s - BEFORE_S) & (captured[:, _T] <= t_s + AFTER_S)]
         self._captured += 1
-        self.captures.append(
-            Capture(
-                self._captured,
-                t_s,
-                float(rows[k, _WALL]),
-                names,
-                captured,
-                bool(rows[-1, _T] > t_s + AFTER_S),
-            )
-        )
+        whole = bool(rows[-1, _T] > t_s + AFTER_S)
+        self.captures.append(Capture(self._captured, t_s, float(rows[k, _WALL]), names, captured, whole))
 
 
 def recorded_past(settings: Settings) -> list[dict[str, Any]]:

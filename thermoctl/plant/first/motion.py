@@ -54,12 +54,9 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
     if drive and not by_force:
         own = UNITS[drive.kind] if drive.unit else "1"
         per_unit = unit if own == "1" else f"{unit}/{own}"
+        each = own if own != "1" else "unit"
         lines.append(
-            unknown(
-                "K_drive",
-                per_unit,
-                f"{unit} for each {own if own != '1' else 'unit'} of '{drive.name}', from its data sheet",
-            )
+            unknown("K_drive", per_unit, f"{unit} for each {each} of '{drive.name}', from its data sheet")
         )
     lines.append(parameter(size, sizes.mass, per, margin) if drive else held(size, per))
     lines.append(parameter("damping", sizes.damping, drag, margin * MARGIN))

@@ -35,13 +35,8 @@ def draft(table: Table, drives: Sequence[Column], sensors: Sequence[Column]) -> 
         if not (d.kind == "flow" and d.unit):
             own = UNITS[d.kind] if d.unit else "1"
             unit = "m^3/s" if own == "1" else f"m^3/s/{own}"
-            lines.append(
-                unknown(
-                    f"K_{ids[d.name]}",
-                    unit,
-                    f"flow for each unit of '{d.name}', measured; levels alone give ratios",
-                )
-            )
+            what = f"flow for each unit of '{d.name}', measured; levels alone give ratios"
+            lines.append(unknown(f"K_{ids[d.name]}", unit, what))
     tanks = [f"tank_{ids[c.name]}" for c in sensors]
     lines += [
         parameter(f"area_{n}", area, "m^2", margin * (1.0 if drives else MARGIN))

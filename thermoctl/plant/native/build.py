@@ -23,18 +23,11 @@ def _compiler() -> tuple[list[str], str]:
     """Return the C compiler's command and a text that identifies its result (version, processor)."""
     for candidate in (os.environ.get("CC"), "cc", "gcc", "clang"):
         if candidate and (path := shutil.which(candidate.split()[0])):
-            version = subprocess.run([path, "--version"], capture_output=True, text=True).stdout.splitlines()[
-                :1
-            ]
+            stated = subprocess.run([path, "--version"], capture_output=True, text=True).stdout
+            version = stated.splitlines()[:1]
             try:
-                flags = next(
-                    (
-                        line
-                        for line in Path("/proc/cpuinfo").read_text().splitlines()
-                        if line.startswith("flags")
-                    ),
-                    "",
-                )
+                lines = Path("/proc/cpuinfo").read_text().splitlines()
+                flags = next((line for line in lines if line.startswith("flags")), "")
             except OSError:
                 flags = ""
             command = [

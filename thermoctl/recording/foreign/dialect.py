@@ -186,13 +186,8 @@ def find_dialect(path: Path, text: str) -> Dialect:
     rows = [(n, c[:width] if n <= longer else c) for n, c in rows]
     begin = _begin(rows, width)
     head = [(n, c) for n, c in rows[:begin]]
-    facts = facts_of(
-        [
-            *comments,
-            *[(n, line) for n, line in sample if n < (rows[begin][0] if begin < len(rows) else 1 << 60)],
-        ],
-        separator,
-    )
+    above = [(n, line) for n, line in sample if begin >= len(rows) or n < rows[begin][0]]
+    facts = facts_of([*comments, *above], separator)
     data = [c for _, c in rows[begin:] if len(c) == width]
     first = rows[begin][0] if begin < len(rows) else rows[-1][0] + 1
     notes = [f"line {longer}: its cells beyond column {width} left out"] if longer else []

@@ -180,12 +180,8 @@ def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
     feeds, titles = content.get("feeds"), content.get("channel", {})
     if not isinstance(feeds, list) or not feeds or not isinstance(titles, dict):
         return None
-    return [
-        _records(
-            path,
-            [{str(titles.get(k, k)) if k.startswith("field") else k: v for k, v in f.items()} for f in feeds],
-        )
-    ]
+    names = {k: str(titles.get(k, k)) if k.startswith("field") else k for f in feeds for k in f}
+    return [_records(path, [{names[k]: v for k, v in f.items()} for f in feeds])]
 
 
 def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
