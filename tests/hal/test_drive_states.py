@@ -167,7 +167,7 @@ def test_an_old_status_word_of_enabled_is_not_a_drive_that_left():
 
 def test_a_drive_lost_while_driving_is_not_enabled_by_its_return():
     bus = Bus().driving()
-    bus.device.steps.reconnect()  # as connect does
+    bus.device._watch_state(AMP_OFFLINE)  # as connect does
     bus.drive.status = DISABLED
     bus.tick(True, 100)
     assert bus.drive.status == DISABLED

@@ -3,9 +3,10 @@
 A device on CAN (DBC file), Modbus or a serial line may take the command. Its profile names the messages for
 set-up, enabling, the command, disabling, and the reset of a fault. It also names the channel of the state.
 
-Only a new `enable` enables (`Enabling`). An amplifier whose state is not reported for longer than the
-channel's `stale_after_s` counts as one that left 'enabled' by itself. A fault is reset only while `enable` is
-False. While disabled, a command of 0 and the disabling messages are repeated.
+Only a new `enable` enables. An amplifier that leaves the state 'enabled' without our command is disabled. It
+stays so until `enable` was withdrawn. The same happens when its state is not reported for longer than the
+channel's `stale_after_s`. A fault is reset only while `enable` is False. While disabled, a command of 0 and
+the disabling messages are repeated.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ from thermoctl_hal.base.backend import (
     Sample,
 )
 from thermoctl_hal.base.binding import Binding
-from thermoctl_hal.base.cia402 import Enabling
 from thermoctl_hal.base.profile import Amplifier, Assumed, Message
 
 REPEAT_S = 0.1  # time between repetitions of enabling and disabling messages
@@ -35,11 +35,10 @@ RESET_S = 1.0  # time between attempts to reset a fault
 CONFIRM_S = 0.5  # longest time for the amplifier to report that it is off
 
 
-class Sequencer(Enabling):
+class Sequencer:
     """State of one amplifier. patience_s: largest age of its reported state, s."""
 
     def __init__(self, amplifier: Amplifier, patience_s: float) -> None:
-        super().__init__()
         self.amplifier, self._patience_s = amplifier, patience_s
         self.fault = 0.0
         self.restart()
@@ -48,7 +47,8 @@ class Sequencer(Enabling):
         """Forget the state, after a new connection."""
         self.state = AMP_OFFLINE if self.amplifier.state else AMP_DISABLED
         self._heard_s = self._next_s = self._command_s = self._reset_s = -math.inf
-        self.forget()
+        self._wanted = self._driving = self.left = False
+        self._left_to = AMP_OFFLINE
 
     def observe(self, raw: float, now_s: float) -> float:
         """Take the reported state; return the AMP_* state to show."""
@@ -72,16 +72,22 @@ class Sequencer(Enabling):
                 AMP_FAULT,
             )
         self.state = state
-        return self.shown(state)
+        if self._driving and not self.left and state != AMP_ENABLED:
+            self.left, self._left_to = True, state
+        if self._wanted and state == AMP_ENABLED and not self.left:
+            self._driving = True
+        return self._left_to if self.left and state != AMP_FAULT else state
 
     def messages(self, drive: float, enable: bool, now_s: float) -> list[tuple[Message, float]]:
         """Return the messages to send now, each with its command in counts."""
-        a, was_wanted = self.amplifier, self.wanted
-        if enable and a.state and self.driving and now_s - self._heard_s > self._patience_s:
-            self.left, self.left_to = True, AMP_OFFLINE
-        wanted = self.wants(enable)
-        if wanted != was_wanted:
-            self._next_s = -math.inf
+        a = self.amplifier
+        if not enable:
+            self._driving = self.left = False
+        elif a.state and self._driving and now_s - self._heard_s > self._patience_s:
+            self.left, self._left_to = True, AMP_OFFLINE
+        wanted = enable and not self.left
+        if wanted != self._wanted:
+            self._wanted, self._next_s = wanted, -math.inf
         if wanted and self.state == AMP_ENABLED:
             if now_s < self._command_s + 1.0 / a.command_hz:
                 return []

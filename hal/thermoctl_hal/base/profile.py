@@ -226,7 +226,7 @@ class Cia402(BusSpec):
     master_id: int = 0  # our own node id, whose heartbeat the drive watches; 0: 127 - the drive's node id
     heartbeat_s: float = 0.02  # period of our heartbeat, and of the one that the drive is asked for
     watchdog_s: float = 0.1  # the drive stops when our heartbeat is missing for this long
-    start_up: tuple[tuple[Object, int], ...] = ()  # further objects and their values, written at set-up
+    start_up: tuple[tuple[int, int, int], ...] = ()  # further (index, sub-index, value) written at set-up
     sdo_timeout_s: float = 0.3  # longest time that the drive may take for an answer at set-up
     objects: Mapping[Object, str] = field(default_factory=dict)  # types of objects where there is no EDS file
 

@@ -4,7 +4,12 @@
 RPDO 1 = control word | command, then SYNC. TPDO 1 answers the SYNC with status word | readings; it is read
 one tick later. Heartbeats go both ways: the drive stops by itself when ours is missing for `watchdog_s`, and
 its channels are ERROR when its own is missing. Set-up (identity, heartbeats, mode, PDO mapping, NMT start):
-thermoctl_hal.can.set_up. States, control words and when it is enabled: thermoctl_hal.base.cia402.
+thermoctl_hal.can.set_up. States and control words: thermoctl_hal.base.cia402.
+
+Only a new `enable` takes the steps towards 'operation enabled'. A drive that leaves it without our command
+(quick stop from an input, supply, its own fault) is disabled. It stays disabled until `enable` was withdrawn
+and is given again. Until then its state reads as the state it left to, so that a stop between two ticks is
+seen, too.
 """
 
 from __future__ import annotations
@@ -15,11 +20,20 @@ import struct
 import time
 from array import array
 
-from thermoctl_hal.base.backend import HardwareError, Sample
+from thermoctl.files.yamlfile import InputError
+from thermoctl_hal.base.backend import AMP_ENABLED, AMP_FAULT, AMP_OFFLINE, HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
-from thermoctl_hal.base.cia402 import DriveSteps, state_name, state_without_role
+from thermoctl_hal.base.cia402 import (
+    FAULT_RESET_S,
+    MAX_STEP_S,
+    drive_state,
+    largest_command,
+    next_control_word,
+    state_name,
+)
 from thermoctl_hal.base.device import Device
 from thermoctl_hal.base.profile import ACTUAL_POSITION, POSITION_MODES, STATUS_WORD, Cia402, Object, typed
+from thermoctl_hal.base.wire import nearest
 from thermoctl_hal.can.bus import AnyPort, open_can
 from thermoctl_hal.can.set_up import (
     NMT_ID,
@@ -36,7 +50,8 @@ from thermoctl_hal.can.set_up import (
 
 _PRE_OPERATIONAL = 0x7F  # NMT state in a heartbeat; 0: the node has just booted
 _COMMANDS = 0x200, 0x300, 0x400, 0x500  # identifiers of RPDO 1 to 4, without the node id
-_SYNC_ID = SYNC_ID  # a number of C, by drive.pxd
+_SYNC_ID, _RESET_S = SYNC_ID, FAULT_RESET_S
+_OFFLINE, _ENABLED, _FAULT = AMP_OFFLINE, AMP_ENABLED, AMP_FAULT  # numbers of C, by drive.pxd
 
 
 class Cia402Device(Device):
@@ -54,17 +69,24 @@ class Cia402Device(Device):
         self._shift = array("i", [8 * sum(sizes[:k]) for k in range(len(sizes))])
         self._bits = array("i", [8 * size for size in sizes])
         self._signed = array("i", [f.islower() for f in formats])
+        self._command_limit = 0
         sources = [typed(b.channel.source, Object) for b in binding.bounds]
         amplifier = binding.profile.amplifier
         if amplifier is not None and STATUS_WORD not in sources:
-            raise state_without_role(binding.place)
+            raise InputError(
+                f"{binding.place}: a drive needs its status word (object 0x6041) in the role amplifier_state: "
+                "without it nobody sees that the drive stopped by itself"
+            )
         self._index = array("i", [spec.transmit.index(o) if o in spec.transmit else -1 for o in sources])
         self._is_state = array("i", [o == STATUS_WORD for o in sources])
         self._patience_s, self._heartbeat_s = max(3 * spec.heartbeat_s, spec.watchdog_s), spec.heartbeat_s
         self._master = spec.master_id
-        tracks = spec.mode in POSITION_MODES
-        self.steps = DriveSteps(amplifier, command, tracks, binding.profile.file)
-        self._actual = spec.transmit.index(ACTUAL_POSITION) if tracks else -1
+        if amplifier is not None:
+            self._command_limit = largest_command(command, amplifier, binding.profile.file)
+            (self._low, self._high), self._scale = amplifier.limits, amplifier.scale
+            self._slew = amplifier.slew_per_s / amplifier.scale
+        self._actual = spec.transmit.index(ACTUAL_POSITION) if spec.mode in POSITION_MODES else -1
+        self._target, self._target_s, self._actual_counts = math.nan, 0.0, 0.0
         self._ids = (
             0x080 + self._node,
             0x180 + self._node,
@@ -72,9 +94,11 @@ class Cia402Device(Device):
             *(base + self._node for base in _COMMANDS),  # another master's
             *range(0x701, 0x780),  # heartbeats: the drive's, and a foreign one with our node id
         )
-        self._fault_code = self._frames = self._emergencies = 0
+        self._status_word = self._fault_code = self._frames = self._emergencies = 0
         self._odd_size, self._odd = -1, 0
-        self._heard_s = self._beat_s = -math.inf
+        self._heard_s = self._beat_s = self._reset_s = -math.inf
+        self._wanted = self._driving = self._left = False
+        self._left_to, self._left_word = _OFFLINE, -1
 
     def connect(self) -> None:
         """Open the port, set the drive up and start its node; the drive stays disabled."""
@@ -87,10 +111,12 @@ class Cia402Device(Device):
             port.close()
             raise HardwareError(f"{self.binding.port} node {self._node}: set-up failed: {e}") from None
         self._port = port
-        self.steps.reconnect()
+        self._status_word = 0
+        self._watch_state(_OFFLINE)  # lost while it drove: it must not be enabled again by itself
+        self._target = math.nan
         self._odd_size, self._odd = -1, 0
         self._heard_s = time.monotonic()
-        self._beat_s = -math.inf
+        self._beat_s = self._reset_s = -math.inf
 
     def switch_off(self) -> None:
         """Disable the drive over a link of its own. Raises HardwareError when the drive does not confirm."""
@@ -147,9 +173,11 @@ class Cia402Device(Device):
 
     def _store(self, sample: Sample, data: int, now_s: float) -> None:
         """Store the readings of a TPDO 1."""
+        self._status_word = int(self._number(data, 0))
         self._frames += 1
-        position = self._number(data, self._actual) if self._actual >= 0 else 0.0
-        state = self.steps.take(int(self._number(data, 0)), position)
+        if self._actual >= 0:
+            self._actual_counts = self._number(data, self._actual)
+        state = self._watch_state(drive_state(self._status_word))
         for i in range(len(self._index)):
             if self._is_state[i]:
                 self.put(sample, i, state, now_s)
@@ -157,6 +185,15 @@ class Cia402Device(Device):
                 self.put(sample, i, self._fault_code, now_s)
             else:
                 self.put(sample, i, self._number(data, self._index[i]), now_s)
+
+    def _watch_state(self, state: float) -> float:
+        """Return the drive's state, or the one that it entered when it left 'operation enabled' by itself."""
+        if self._driving and not self._left and state != _ENABLED:
+            self._left, self._left_to = True, state
+            self._left_word = self._status_word
+        if self._wanted and state == _ENABLED and not self._left:
+            self._driving, self._left_word = True, -1
+        return self._left_to if self._left and state != _FAULT else state
 
     def _number(self, data: int, k: int) -> float:
         """Return object k of TPDO 1."""
@@ -167,11 +204,21 @@ class Cia402Device(Device):
 
     def write(self, drive: float, enable: bool, now_s: float) -> None:
         """Send RPDO 1, SYNC, and our heartbeat when it is due, in one write."""
-        port = self._port
+        port, counts = self._port, 0
         if port is None:
             raise HardwareError("not connected")
-        word = self.steps.control_word(enable, now_s)
-        counts = self.steps.counts(drive, now_s)
+        self._wanted = enable
+        if not enable:
+            self._driving = self._left = False
+        steps = enable and not self._left
+        word = next_control_word(self._status_word, steps)
+        if self._actual >= 0:
+            counts = self._position_target(drive, steps, now_s)
+        elif steps and drive_state(self._status_word) == _ENABLED:
+            counts = nearest(min(max(drive, self._low), self._high) / self._scale)
+        counts = min(max(counts, -self._command_limit), self._command_limit)
+        if not enable and self._status_word & 0x4F == 0x08 and now_s - self._reset_s >= _RESET_S:
+            word, self._reset_s = 0x80, now_s
         port.queue(0x200 + self._node, word | (counts & 0xFFFFFFFF) << 16, self._receive_size)
         port.queue(_SYNC_ID, 0, 0)
         if now_s - self._beat_s >= self._heartbeat_s:
@@ -179,14 +226,27 @@ class Cia402Device(Device):
             port.queue(0x700 + self._master, 0x05, 1)
         port.flush()
 
+    def _position_target(self, drive: float, steps: bool, now_s: float) -> int:
+        """Return the target position in counts: the present one until enabled, then towards `drive`.
+
+        The target moves by at most `slew_per_s`, so that enabling or a step of the command is no jump."""
+        step = self._slew * min(max(now_s - self._target_s, 0.0), MAX_STEP_S)
+        self._target_s = now_s
+        if not steps or drive_state(self._status_word) != _ENABLED or self._target != self._target:
+            self._target = self._actual_counts
+        else:
+            wanted = min(max(drive, self._low), self._high) / self._scale
+            self._target += min(max(wanted - self._target, -step), step)
+        return nearest(self._target)
+
     def explain(self, sample: Sample, role: int) -> str:
         """Say also how a drive left 'operation enabled' by itself, until it is enabled anew."""
-        found, word = super().explain(sample, role), self.steps.left_word
-        if found or word < 0 or not self._is_state[self.roles.index(role)]:
+        found = super().explain(sample, role)
+        if found or self._left_word < 0 or not self._is_state[self.roles.index(role)]:
             return found
         return (
-            f"{self.name}: left 'operation enabled' without a command: {state_name(word)} "
-            f"(status word 0x{word:04X}): check its stop, limit and enable inputs and its supply"
+            f"{self.name}: left 'operation enabled' without a command: {state_name(self._left_word)} "
+            f"(status word 0x{self._left_word:04X}): check its stop, limit and enable inputs and its supply"
         )
 
     def silence(self) -> str:

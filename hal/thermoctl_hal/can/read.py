@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
-from thermoctl_hal.base.cia402 import read_object_name, read_objects, read_start_up
+from thermoctl_hal.base.cia402 import OBJECT_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import named, sentinel_of, take, whole_range
 from thermoctl_hal.base.profile import (
     ERROR_CODE,
@@ -143,9 +143,30 @@ def read_cia402(top: Section, folder: Path) -> Cia402:
     transmit = tuple(read_object_name(n, "transmit") for n in k["transmit"])
     if not transmit or transmit[0] != STATUS_WORD:
         raise s.get("transmit").error("transmit: the objects of TPDO 1, the status word '0x6041' first")
-    k |= {"eds": eds, "transmit": transmit, "command": read_object_name(k["command"], "command")}
-    k["start_up"] = tuple(read_start_up(node) for node in k["start_up"] or ())
-    spec = Cia402(**{**k, "objects": read_objects(k["objects"])})
+    start_up = []
+    for node in k["start_up"] or ():
+        w = Section(node, "start_up")
+        v = take(w, START_UP)
+        start_up.append((v["index"], v["sub"], v["value"]))
+        w.end()
+    objects = {}
+    if k["objects"] is not None:
+        for name, node in k["objects"].node.value.items():
+            item = read_object_name(Node(name, node.file, node.line, node.column), "objects")
+            objects[item] = k["objects"].text(name, choices=OBJECT_TYPES)
+    spec = Cia402(
+        eds,
+        k["node_id"],
+        k["mode"],
+        read_object_name(k["command"], "command"),
+        transmit,
+        k["master_id"],
+        k["heartbeat_s"],
+        k["watchdog_s"],
+        tuple(start_up),
+        k["sdo_timeout_s"],
+        objects,
+    )
     if spec.watchdog_s < 2 * spec.heartbeat_s:
         raise s.node.error(
             f"watchdog_s: {spec.watchdog_s:g} s is below two heartbeats of {spec.heartbeat_s:g} s: "

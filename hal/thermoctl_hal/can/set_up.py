@@ -17,7 +17,7 @@ import time
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.base.cia402 import CONTROL_WORD, MODE, STANDARD_TYPES, write_mapping
+from thermoctl_hal.base.cia402 import CONTROL_WORD, STANDARD_TYPES
 from thermoctl_hal.base.profile import ERROR_CODE, FIELD_TYPES, STATUS_WORD, Cia402, Object, object_name
 from thermoctl_hal.base.wire import CanPort
 from thermoctl_hal.can.eds import Entry, read_eds
@@ -42,7 +42,7 @@ class Objects:
     Raises InputError with the object."""
 
     def __init__(self, spec: Cia402, place: str, node: int) -> None:
-        self._known = STANDARD_TYPES | dict(spec.objects)
+        self._known = {Object(index): t for index, t in STANDARD_TYPES.items()} | dict(spec.objects)
         if spec.eds is None:
             self.place, self.eds = place, None
             return
@@ -223,9 +223,9 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
     sdo.write(CONTROL_WORD, "H", 0)
     sdo.write(Object(0x1016, 1), "I", spec.master_id << 16 | round(spec.watchdog_s * 1000))
     sdo.write(Object(0x1017), "H", round(spec.heartbeat_s * 1000))
-    sdo.write(MODE, "b", spec.mode)
-    for item, value in spec.start_up:
-        sdo.write(item, formats[item], value)
+    sdo.write(Object(0x6060), "b", spec.mode)
+    for index, sub, value in spec.start_up:
+        sdo.write(Object(index, sub), formats[Object(index, sub)], value)
     _map_pdo(sdo, 0x1800, 0x180 + node | PDO_NO_RTR, [(o, formats[o]) for o in spec.transmit])
     _map_pdo(sdo, 0x1400, 0x200 + node, [(CONTROL_WORD, "H"), (spec.command, formats[spec.command])])
     fault_code = sdo.read(ERROR_CODE)
@@ -245,6 +245,7 @@ def set_up(sdo: Sdo, spec: Cia402, formats: dict[Object, str], where: str) -> in
 
 def _map_pdo(sdo: Sdo, communication: int, cob_id: int, objects: list[tuple[Object, str]]) -> None:
     """Map a PDO to these objects, at every SYNC; drop PDO_NO_RTR when the drive refuses it."""
+    mapping = communication + 0x200
     try:
         sdo.write(Object(communication, 1), "I", cob_id | PDO_INVALID)
     except HardwareError:
@@ -253,7 +254,10 @@ def _map_pdo(sdo: Sdo, communication: int, cob_id: int, objects: list[tuple[Obje
         cob_id &= ~PDO_NO_RTR
         sdo.write(Object(communication, 1), "I", cob_id | PDO_INVALID)
     sdo.write(Object(communication, 2), "B", 1)
-    write_mapping(sdo.write, communication + 0x200, objects)
+    sdo.write(Object(mapping), "B", 0)
+    for k, ((index, sub), letter) in enumerate(objects, 1):
+        sdo.write(Object(mapping, k), "I", index << 16 | sub << 8 | 8 * struct.calcsize(letter))
+    sdo.write(Object(mapping), "B", len(objects))
     sdo.write(Object(communication, 1), "I", cob_id)
 
 
@@ -278,7 +282,8 @@ def check_objects(objects: Objects, spec: Cia402) -> dict[Object, str]:
         raise InputError(
             f"{objects.place}: command: {spec.eds}: object {object_name(spec.command)} has no sign"
         )
-    for item, value in spec.start_up:
+    for index, sub, value in spec.start_up:
+        item = Object(index, sub)
         letter = formats[item] = objects.format(item, "start_up")
         try:
             struct.pack("<" + letter, value)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
-from thermoctl_hal.base.cia402 import STANDARD_TYPES, read_object_name, read_objects, read_start_up
+from thermoctl_hal.base.cia402 import OBJECT_TYPES, STANDARD_TYPES, START_UP, read_object_name
 from thermoctl_hal.base.key import sentinel_of, take
 from thermoctl_hal.base.profile import (
     FIELD_TYPES,
@@ -49,11 +49,6 @@ class Ethercat(BusSpec):
         """Return the position."""
         return self.position
 
-    def place_of(self, item: Object) -> Place:
-        """Return the place of an object of `transmit`."""
-        before = list(self.transmit.values())[: list(self.transmit).index(item)]
-        return Place(struct.calcsize("<" + "".join(before)), self.transmit[item])
-
 
 @dataclass(frozen=True)
 class Place:
@@ -89,7 +84,11 @@ def read_ethercat(top: Section, _folder: Path) -> Ethercat:
     """Read `ethercat`, the description of a slave. Raises InputError."""
     s = top.section("ethercat")
     k = take(s, ETHERCAT["ethercat"])
-    types = STANDARD_TYPES | read_objects(k.pop("objects"))
+    types: dict[Object, str] = {Object(index): t for index, t in STANDARD_TYPES.items()}
+    if k["objects"] is not None:
+        for name, node in k["objects"].node.value.items():
+            item = read_object_name(Node(name, node.file, node.line, node.column), "objects")
+            types[item] = k["objects"].text(name, choices=OBJECT_TYPES)
     transmit = {}
     for node in k["transmit"] or ():
         item = read_object_name(node, "transmit")
@@ -102,11 +101,20 @@ def read_ethercat(top: Section, _folder: Path) -> Ethercat:
             raise k["command"].error(f"command: object {object_name(item)} has no sign")
         if next(iter(transmit), None) != STATUS_WORD:
             raise s.node.error("transmit: a drive sends its status word 0x6041 first")
-    watchdog_s = _watchdog(s, k)
-    start_up = tuple(_start_up(node, types) for node in k["start_up"] or ())
+    spec = Ethercat(
+        k["vendor_id"],
+        k["product_code"],
+        k["position"],
+        k["input_bytes"],
+        transmit,
+        command,
+        k["mode"],
+        tuple(_start_up(node, types) for node in k["start_up"] or ()),
+        _watchdog(s, k),
+        k["timeout_s"],
+    )
     s.end()
-    k |= {"transmit": transmit, "command": command, "watchdog_s": watchdog_s, "start_up": start_up}
-    return Ethercat(**k)
+    return spec
 
 
 def _watchdog(s: Section, k: dict[str, Any]) -> float | None:
@@ -131,13 +139,16 @@ def _letter(types: Mapping[Object, str], item: Object, node: Node, key: str) -> 
 
 
 def _start_up(node: Node, types: Mapping[Object, str]) -> tuple[Object, str, int]:
-    item, value = read_start_up(node)
+    w = Section(node, "start_up")
+    v = take(w, START_UP)
+    w.end()
+    item = Object(v["index"], v["sub"])
     letter = _letter(types, item, node, "start_up")
     try:
-        struct.pack("<" + letter, value)
+        struct.pack("<" + letter, v["value"])
     except struct.error:
-        raise node.error(f"start_up: {value} does not fit object {object_name(item)}") from None
-    return item, letter, value
+        raise node.error(f"start_up: {v['value']} does not fit object {object_name(item)}") from None
+    return item, letter, v["value"]
 
 
 def read_place(s: Section, spec: BusSpec) -> Place:
@@ -181,9 +192,11 @@ def _place(s: Section, k: dict[str, Any], spec: Ethercat) -> Place:
                 f"byte: {place.end - 1} of the inputs is outside the {spec.input_bytes} input_bytes"
             )
         return place
-    item = read_object_name(k["object"], "object")
-    if item not in spec.transmit:
-        raise k["object"].error(
-            f"object: {object_name(item)} is not sent by the slave; add it to 'transmit', or give its 'byte'"
-        )
-    return spec.place_of(item)
+    item, offset = read_object_name(k["object"], "object"), 0
+    for sent, letter in spec.transmit.items():
+        if sent == item:
+            return Place(offset, letter)
+        offset += struct.calcsize("<" + letter)
+    raise k["object"].error(
+        f"object: {object_name(item)} is not sent by the slave; add it to 'transmit', or give its 'byte'"
+    )

@@ -8,13 +8,14 @@ from typing import Any
 
 from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.base.binding import Binding
-from thermoctl_hal.base.cia402 import CONTROL_WORD, MODE, write_mapping
+from thermoctl_hal.base.cia402 import CONTROL_WORD
 from thermoctl_hal.base.profile import Object, typed
 from thermoctl_hal.ethercat.read import Ethercat, Place
 
 OUTPUT_CONTROL = 0x0814  # control byte of sync manager 2, the outputs
 TRIGGERS_WATCHDOG = 0x40
 RECEIVE_PDO, TRANSMIT_PDO, RECEIVE_ASSIGN, TRANSMIT_ASSIGN = 0x1600, 0x1A00, 0x1C12, 0x1C13
+MODE = Object(0x6060)
 
 
 class SlaveSetUp:
@@ -50,7 +51,10 @@ class SlaveSetUp:
             mapped.append((RECEIVE_ASSIGN, RECEIVE_PDO, [(CONTROL_WORD, "H"), spec.command]))
         for assign, pdo, entries in mapped if spec.transmit else ():
             put(Object(assign), "B", 0)
-            write_mapping(put, pdo, entries)
+            put(Object(pdo), "B", 0)
+            for k, ((index, sub), letter) in enumerate(entries, 1):
+                put(Object(pdo, k), "I", index << 16 | sub << 8 | 8 * struct.calcsize("<" + letter))
+            put(Object(pdo), "B", len(entries))
             put(Object(assign, 1), "H", pdo)
             put(Object(assign), "B", 1)
         if spec.watchdog_s is not None:
