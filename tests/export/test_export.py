@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 import pytest
 
-from tests.export.plants import FRICTION, plants, recording
+from tests.export.plants import DELAYED, FRICTION, plants, recording
 from thermoctl import cli
 from thermoctl.export.commands import write
 from thermoctl.files.yamlfile import InputError
@@ -246,6 +246,27 @@ def test_the_command(to, tmp_path, monkeypatch, capsys):
     assert (tmp_path / name).stat().st_size > 1000
     assert cli.main(["plant", "export", "two.yaml", "--to", to, "--out", "two.txt"]) == 2
     assert "a file that ends in" in capsys.readouterr().err
+
+
+def test_an_input_that_is_logged_late_needs_its_recording(tmp_path):
+    """A program that is given one row after the other does not know the next: only the Python file has all rows."""
+    ahead = {"delay(heat, transport)": "delay(heat, -transport)", "delay(air, slow)": "delay(air, -slow)"}
+    text = DELAYED
+    for late, early in ahead.items():
+        text = text.replace(late, early)
+    plant = loads(text)
+    table = recording(plant)
+    model = compile_plant(plant, ())
+    excitation = model.prepare(model.excitation(table))
+    write(plant, "python", tmp_path / "plant.py", table)
+    module = {}
+    exec(compile((tmp_path / "plant.py").read_text(), "plant.py", "exec"), module)
+    found = module["simulate"](excitation.t, dict(zip(plant.inputs, excitation.u[:, :2].T, strict=True)))
+    near(np.array([found[o] for o in plant.outputs]).T, model.run(excitation, rtol=1e-9).y)
+    for to in ("c", "fmu", "modelica"):
+        with pytest.raises(InputError, match="7.3 s ahead of its time.*--to python"):
+            write(plant, to, tmp_path / "plant", table)
+        assert not (tmp_path / "plant").exists()
 
 
 def test_the_python_file_needs_nothing_of_ours(tmp_path):

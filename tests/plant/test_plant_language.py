@@ -72,6 +72,7 @@ def test_good_file_survives_a_round_trip():
         (("flows", "loss", "rate"), "", ""),
         (("flows", "loss", "rate"), "G * delay(T, 3)", "delay"),
         (("outputs", "y", "value"), "delay(T, -3)", "reach -3; 0 at least"),
+        (("outputs", "y", "value"), "delay(T - air, -3)", "more than recorded inputs"),
         (("outputs", "y", "value"), "delay(T, C - 50)", "reach -30; 0 at least"),  # at the lower bound of C
         (("flows", "loss", "rate"), "G * first(air)", "first"),
         (("flows", "loss", "rate"), "__import__('os').system('true')", "'"),

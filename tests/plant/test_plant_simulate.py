@@ -176,6 +176,34 @@ outputs: {y: {value: T}, late: {value: "delay(T, TD)"}}"""
     assert run.y[0, 1] == pytest.approx(20.0)
 
 
+@pytest.mark.parametrize("between", ["hold", "linear"])
+def test_an_input_that_is_logged_late_is_read_ahead(between):
+    """delay() of less than no time: two and a half rows, against the same plant whose rows are exact, ten times as dense."""
+    text = (
+        HEAD
+        + f"""
+inputs: {{P: {{unit: W, between_samples: {between}}}}}
+parameters: {{C: {{value: 10}}, TA: {{value: 2.5, unit: s, range: [0, 9]}}}}
+nodes: {{T: {{storage: C, initial: 20}}}}
+flows: {{heat: {{into: T, rate: "delay(P, -TA)"}}, out: {{from: T, rate: 0.5 * (T - 20)}}}}
+outputs: {{y: {{value: T}}}}"""
+    )
+    t = np.arange(0, 60, 1.0)
+    rows = 4 * (np.sin(t * t / 60) > 0) if between == "hold" else 4 * np.sin(t / 5) ** 2
+    model = compile_plant(loads(text))
+    run = model.simulate(Table("d", "d.csv", t, {"P": rows}), sensitivities=True)
+    dense = np.arange(0, 59.05, 0.1) + 1e-9
+    k = np.clip(np.searchsorted(t, dense + 2.5, side="right") - 1, 0, len(t) - 1)
+    early = rows[k] if between == "hold" else np.interp(dense + 2.5, t, rows)
+    exact = compile_plant(loads(text.replace("delay(P, -TA)", "P * TA / 2.5")))
+    y = exact.simulate(Table("e", "e.csv", dense, {"P": early})).y[::10, 0]
+    # a row's mean stands for a switch inside it: right at the rows but for the decay within one
+    assert np.allclose(run.y[:, 0], y, atol=0.02) and np.ptp(y) > 4
+    step = [model.simulate(Table("d", "d.csv", t, {"P": rows}), {"TA": 2.5 + s}).y for s in (-1e-3, 1e-3)]
+    slope, c = (step[1] - step[0]) / 2e-3, model.active.index("TA")
+    assert np.sqrt(np.mean((run.dy[:, 0, c] - slope[:, 0]) ** 2)) < 0.02 * np.sqrt(np.mean(slope**2))
+
+
 def test_static_plant_has_no_states():
     plant = loads(
         HEAD

@@ -16,6 +16,7 @@ from thermoctl.export.values import values
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, load
+from thermoctl.plant import expression as ex
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.equations import Equations
 from thermoctl.recording.foreign.logger import options
@@ -48,6 +49,13 @@ def write(plant: Plant, to: str, out: Path, recording: Table | None = None) -> N
             f"{plant.file}: a plant that calls an FMU cannot be exported; write the effect into the FMU's own model"
         )
     numbers = values(plant, equations, recording)
+    delays = (*equations.input_delays.values(), *equations.output_delays.values())
+    ahead = [float(ex.evaluate(seconds, numbers.parameters)) for _, seconds in delays]
+    if to != "python" and min(ahead, default=0.0) < 0:
+        raise InputError(
+            f"{plant.file}: an input is read {-min(ahead):g} s ahead of its time, which only a recording can give: "
+            "shift its column and take the delay() out, or use --to python"
+        )
     name = re.sub(r"\W", "_", out.stem)
     name = name if name[:1].isalpha() else f"plant_{name}"
     if to == "fmu":

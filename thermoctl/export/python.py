@@ -154,17 +154,18 @@ def simulate(t, inputs, parameters=None, first=None, rtol=1e-10):
     u = [np.broadcast_to(np.asarray(inputs[i], float), t.shape) for i in INPUTS]
     start = {**FIRST, **{i: float(v[0]) for i, v in zip(INPUTS, u)}, **(first or {})}
     for (signal, seconds), straight in zip(input_delays(u, p), DELAYED_LINEAR):
-        at, s = t - max(seconds, 0.0), np.broadcast_to(signal, t.shape)
+        at, s = t - seconds, np.broadcast_to(signal, t.shape)
         if straight:
             u.append(np.interp(at, t, s))
             continue
         area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(t))])
-        area = np.where(at < 0, at * s[0], np.interp(at, t, area))  # before the start: the first value
+        # before the start: the first value, and after the end: the last one
+        area = np.interp(at, t, area) + np.minimum(at, 0.0) * s[0] + np.maximum(at - t[-1], 0.0) * s[-1]
         mean = np.diff(area) / np.diff(t)
         u.append(np.append(mean, mean[-1]))
     u = np.array(u).reshape(len(u), len(t))
     x = _integrate(t, u, np.array(LINEAR + DELAYED_LINEAR, bool), initial(u[:, 0], p, start), p, rtol)
-    past = [(np.broadcast_to(g, t.shape), np.maximum(t - max(s, 0.0), 0.0)) for g, s in output_delays(t, x, u, p, WIDTHS)]
+    past = [(np.broadcast_to(g, t.shape), np.clip(t - s, 0.0, t[-1])) for g, s in output_delays(t, x, u, p, WIDTHS)]
     d = [Akima1DInterpolator(t, g)(at) for g, at in past]
     y = outputs(t, x, u, p, WIDTHS, d)
     return {**dict(zip(STATES, x)), **dict(zip(OUTPUTS, y))}

@@ -670,7 +670,7 @@ def _value(
             return np.interp(x, xs, ys)
         slopes = np.concatenate([[0.0], np.diff(ys) / np.diff(xs), [0.0]])
         return slopes[np.searchsorted(xs, x, side="right")]
-    if op == "delay" and "t" in values:  # interpolate linearly between samples at values["t"]
+    if op == "delay" and np.ndim(values.get("t", 0.0)):  # interpolate linearly between samples at values["t"]
         t = np.asarray(values["t"], float)
         return np.interp(t - a[1], t, np.broadcast_to(a[0], t.shape))
     raise ExpressionError(f"'{op}' cannot stand here")

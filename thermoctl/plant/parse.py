@@ -354,9 +354,10 @@ def _check_delay(e: Expr, p: _Place, plant: Plant) -> None:
         )
     if p.delays == "inputs" and not ex.names(signal) <= set(plant.inputs):
         raise p.node.error(f"{p.what}: delay() in a rate may read inputs only")
-    if not (least := _least(seconds, plant)) >= 0:
+    if not (least := _least(seconds, plant)) >= 0 and not ex.names(signal) <= set(plant.inputs):
         raise p.node.error(
-            f"{p.what}: the seconds of delay() reach {least:g}; 0 at least was expected, over the whole range of a parameter"
+            f"{p.what}: the seconds of delay() reach {least:g}; 0 at least was expected, over the whole range of a parameter, "
+            "where it reads more than recorded inputs"
         )
 
 

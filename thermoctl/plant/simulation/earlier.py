@@ -13,15 +13,16 @@ def earlier(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return a signal g (N,) some seconds earlier, its slope there, and its changes dg (N, k), earlier.
 
-    Between two samples it is Akima's cubic (J. ACM 17 (1970) 589). Before the start g is held."""
-    at = np.maximum(t - seconds, t[0])
+    Between two samples it is Akima's cubic (J. ACM 17 (1970) 589). Outside the recording g is held."""
+    at = np.clip(t - seconds, t[0], t[-1])
     k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     h = t[k + 1] - t[k]
     s = (at - t[k]) / h
     share = _shares(t, g)
     values = (1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2 * h, s * s * (3 - 2 * s), s * s * (s - 1) * h
     slopes = 6 * s * (s - 1) / h, (1 - s) * (1 - 3 * s), 6 * s * (1 - s) / h, s * (3 * s - 2)
-    rate = np.where(t - seconds > t[0], _cubic(t, g, share, k, slopes), 0.0)
+    inside = (t - seconds > t[0]) & (t - seconds <= t[-1])
+    rate = np.where(inside, _cubic(t, g, share, k, slopes), 0.0)
     changes = None if dg is None else _cubic(t, dg, share, k, values)
     return _cubic(t, g, share, k, values), rate, changes
 

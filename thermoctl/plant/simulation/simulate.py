@@ -197,23 +197,25 @@ class Model:
         columns = {i: u[:, j] for j, i in enumerate(self.plant.inputs)}
         for j, (signal, seconds) in enumerate(self.code.input_delays.values()):
             s = np.broadcast_to(np.asarray(ex.evaluate(signal, columns), float), excitation.t.shape)
-            td = max(float(ex.evaluate(seconds, known)), 0.0)
+            td = float(ex.evaluate(seconds, known))
             if all(self.plant.inputs[i].linear for i in ex.names(signal)):
                 u[:, n + j] = np.interp(excitation.t - td, excitation.t, s)
                 slope = np.interp(excitation.t - td + 1e-9, excitation.t, s) - u[:, n + j]
                 u[:, n + len(self.code.input_delays) + j] = -slope / 1e-9
-                excitation.linear[n + j] = 1
+                excitation.linear[[n + j, n + len(self.code.input_delays) + j]] = 1
             else:
                 area = np.concatenate([[0.0], np.cumsum(s[:-1] * np.diff(excitation.t))])
                 at = excitation.t - td
 
                 def integral(
                     z: np.ndarray, area: np.ndarray = area, s: np.ndarray = s
-                ) -> np.ndarray:  # before the start: the first value
+                ) -> np.ndarray:  # before the start: the first value, and after the end: the last one
                     """Return the integral of the held signal from the start to the times z, s."""
-                    return np.where(
-                        z < excitation.t[0], (z - excitation.t[0]) * s[0], np.interp(z, excitation.t, area)
+                    before, after = (
+                        np.minimum(z - excitation.t[0], 0.0),
+                        np.maximum(z - excitation.t[-1], 0.0),
                     )
+                    return np.interp(z, excitation.t, area) + before * s[0] + after * s[-1]
 
                 dt = np.diff(excitation.t)
                 u[:-1, n + j] = np.diff(integral(at)) / dt
@@ -498,7 +500,7 @@ class Model:
         known = dict(zip(self.parameters, p, strict=True))
         out, dout = np.empty_like(g), None if dg is None else np.empty_like(dg)
         for j, (_, seconds) in enumerate(self.code.output_delays.values()):
-            td = max(float(ex.evaluate(seconds, known)), 0.0)
+            td = float(ex.evaluate(seconds, known))
             out[:, j], slope, changes = earlier(t, g[:, j], td, None if dg is None else dg[:, j])
             if dout is not None:
                 dout[:, j] = changes
