@@ -47,7 +47,7 @@ prove: develop                     # the full proof on concealed cases: made, se
 	$(BIN)/python -m tests.proof $(PROOF)/cases --answers $(PROOF)/answers --out $(PROOF)/result
 
 .PHONY: truth
-truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60; SEED= other generated cases, FORM=coarse or late
+truth: develop                     # the diagnosis on frozen cases, real rigs, other people's systems, beside an older result (OLD=); NUMBER=60; SEED= other generated cases, FORM=coarse, late or row
 	$(BIN)/python -m tests.truth --number $(if $(filter file,$(origin NUMBER)),60,$(NUMBER)) $(if $(filter file,$(origin SEED)),,--seed $(SEED)) $(if $(FORM),--form $(FORM)) $(if $(OLD),--old $(OLD))
 
 .PHONY: ablate

@@ -1,5 +1,6 @@
 """A heater that switches between the rows of a logger is read on straight lines; one that switches at rows is held."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,11 @@ from tests.bench.between import named
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import Memory
+from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
 from thermoctl.plant import load
 from thermoctl.recording.table import Table
 
@@ -62,6 +66,23 @@ def test_a_diagnosis_that_goes_on_reads_inputs_as_before(tmp_path):
 def test_what_the_plant_file_states_is_not_asked(tmp_path):
     text = ONE_BLOCK.replace("{unit: W}", "{unit: W, between_samples: hold}", 1)
     assert not taken(text, True, tmp_path).plant.inputs["heat"].linear
+
+
+def test_a_heater_that_is_logged_a_row_late_is_said_to_be_late(tmp_path):
+    """The block answers before its heater changes. Nothing of the plant is missing, and its parameters are right."""
+    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
+    late = []
+    for seed in (1, 2):
+        r = recording(False, seed)
+        late.append(replace(r, columns=r.columns | {"heat": np.roll(r.columns["heat"], 1)}))
+    d = diagnose(load(tmp_path / "plant.yaml"), late, catalogue(), limits())
+    (found,) = contract(d)["findings"]
+    assert (found["effect"], found["where"]) == ("sensor_advance", "heat") and found["probability"] > 0.99
+    (advance,) = found["parameters"].values()
+    assert advance["value"] == pytest.approx(EVERY_S, abs=3 * advance["sd"]) and advance["sd"] < 0.1
+    assert contract(d)["verdict"] == "explained"
+    values = d.best.plant.parameters
+    assert values["C"].value == pytest.approx(C, rel=0.01) and values["G"].value == pytest.approx(G, rel=0.01)
 
 
 @pytest.mark.slow  # half a minute: two diagnoses

@@ -118,6 +118,9 @@ def _generated(world: str, name: str, folder: Path) -> Case:
     wanted = tuple(map(is_it, known))
     if "each" in answer:  # of each effect, all names that the data cannot tell from it
         wanted = tuple(_one_of([(e, w) for e, w in names]) for names in answer["each"])
+    wanted += tuple(
+        _one_of([(e, w)]) for e, w in answer.get("late", ())
+    )  # a fault of the recording (forms.py)
     return Case(world, _job(name, folder), answer, wanted, truth.of_misfit)
 
 

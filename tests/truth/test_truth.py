@@ -14,7 +14,7 @@ from tests.truth import __main__ as truth
 from tests.truth import ablate, judge, run
 from tests.truth import cases as made
 from tests.truth.ablate import RULES, left_out, part_of
-from tests.truth.forms import FORMS, changed
+from tests.truth.forms import changed
 from thermoctl.diagnosis.limits import limits
 
 
@@ -76,7 +76,7 @@ def test_other_forms_of_a_case_are_coarse_or_late_and_keep_the_answer(tmp_path):
     lines = [f"{a},{'' if k == 7 else a}" for k, a in enumerate(t)]
     (case / "run_1.csv").write_text("\n".join(["t,V", *lines]) + "\n")
     read = {}
-    for form in FORMS:
+    for form in ("coarse", "late"):
         folder = changed(case, form)
         assert folder == tmp_path / f"closed-{form}" / "0001" and (folder / "answer.yaml").exists()
         read[form] = np.genfromtxt(folder / "run_1.csv", delimiter=",", skip_header=1)
@@ -93,6 +93,22 @@ def test_other_forms_of_a_case_are_coarse_or_late_and_keep_the_answer(tmp_path):
     after = np.delete(read["late"][:-1], 7, axis=0)
     ahead = after[:, 1] - after[:, 0]
     assert 0 <= ahead.min() < 0.005 and 0.015 < ahead.max() <= 0.02
+
+
+def test_a_case_whose_input_is_logged_a_row_late_wants_that_to_be_named(tmp_path):
+    answer = {"verdict": "explained", "effects": [["radiation", "a"]], "nearly_the_same": [], "kind": "one"}
+    case = a_case(tmp_path / "closed" / "0001", answer, lambda folder: folder)
+    (case / "run_2.csv").unlink()
+    inputs = {"air": {"unit": "degC", "between_samples": "linear"}, "power": {"unit": "W", "column": "P"}}
+    (case / "plant.yaml").write_text(yaml.safe_dump({"inputs": inputs, "outputs": {"y": {"noise": 1}}}))
+    (case / "run_1.csv").write_text("t,P,air,y\n" + "".join(f"{k},{k}.5,{k},{k}\n" for k in range(5)))
+    folder = changed(case, "row")
+    rows = np.genfromtxt(folder / "run_1.csv", delimiter=",", skip_header=1)
+    k = np.arange(5.0)
+    assert np.array_equal(rows, np.column_stack([k, [0.5, 0.5, 1.5, 2.5, 3.5], k, k]))
+    late = made._generated("closed", "closed-row-0001", folder)
+    names = [("radiation", "a"), ("sensor_advance", "power"), ("sensor_advance", "air")]
+    assert [late.judge(n) for n in names] == ["right", "right", "stray"] and len(late.wanted) == 2
 
 
 def test_figures_of_a_hand_made_group(tmp_path):

@@ -2,18 +2,20 @@
 
 A logger that polls a device records a switch up to one row late, half a row on average. Held until the next
 row, such an input is late by this half. Refits of the plant imitate that by lags and hidden masses. On
-straight lines the mean is right, if the input enters in proportion: the heat of a current does not."""
+straight lines the mean is right, if the input enters in proportion: the heat of a current does not. An input
+that is held, and logged a whole row late, stays held: the catalogue has an effect for it."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from thermoctl.checks.data import driving_inputs
 from thermoctl.diagnosis.data.case import ROUGH, Budget, Case
 from thermoctl.diagnosis.evidence.fit import fitted
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.language import Plant
@@ -43,18 +45,15 @@ def between(plant: Plant, made: Callable[[Plant], Case]) -> Case:
     inputs = {**plant.inputs} | {i.name: dataclasses.replace(i, linear=True) for i in loose}
     if past.recordings:
         return made(dataclasses.replace(plant, inputs=inputs))
-    straight = dataclasses.replace(case.plant, inputs=inputs)
-    model = compile_plant(straight)
     try:
-        null = fit(model, case.drives(model), case.noise, tolerance=ROUGH, seconds=np.inf)
-        gain = _alone(dataclasses.replace(case, plant=straight, null=null)) - _alone(case)
-    except (SimulationError, np.linalg.LinAlgError):
-        return case
-    if gain <= CLEARLY:
+        held, straight = _alone(case), _alone(case, dataclasses.replace(case.plant, inputs=inputs))
+        if straight <= held + CLEARLY or _alone(case, _early(case, [i.name for i in loose])) > straight:
+            return case
+    except (InputError, SimulationError, np.linalg.LinAlgError):
         return case
     better, names = made(dataclasses.replace(plant, inputs=inputs)), ", ".join(f"'{i.name}'" for i in loose)
     better.notes.append(
-        f"straight lines between the rows of {names} let the plant alone follow the recordings better ({gain:.0f} nats), as "
+        f"straight lines between the rows of {names} let the plant alone follow the recordings better ({straight - held:.0f} nats), as "
         "where a switch is logged up to a row late: taken so; between_samples in the plant file says what is right"
     )
     return better
@@ -68,7 +67,23 @@ def _in_proportion(plant: Plant, name: str) -> bool:
     )
 
 
-def _alone(case: Case) -> float:
-    """Return the log evidence of the plant without effects."""
+def _early(case: Case, inputs: Sequence[str]) -> Plant:
+    """Return the plant with its inputs a row earlier, as held inputs fit that are logged a row late."""
+    row = float(np.median(np.concatenate([np.diff(t.t) for t in case.tables])))
+    early = {i: ex.make("delay", ex.name(i), ex.num(-row)) for i in inputs}
+    plant = case.plant
+    flows = {k: dataclasses.replace(f, rate=ex.fill(f.rate, early)) for k, f in plant.flows.items()}
+    outputs = {k: dataclasses.replace(o, value=ex.fill(o.value, early)) for k, o in plant.outputs.items()}
+    return dataclasses.replace(plant, flows=flows, outputs=outputs)
+
+
+def _alone(case: Case, plant: Plant | None = None) -> float:
+    """Return the log evidence of the case's plant, or of another one, without effects.
+
+    Raises SimulationError; InputError for a delay within a delay."""
     uncounted = dataclasses.replace(case, budget=Budget(1))
-    return fitted(uncounted, case.plant, (), case.null).log_evidence
+    if plant is not None:
+        model = compile_plant(plant)
+        null = fit(model, case.drives(model), case.noise, tolerance=ROUGH, seconds=np.inf)
+        uncounted = dataclasses.replace(uncounted, plant=plant, null=null)
+    return fitted(uncounted, uncounted.plant, (), uncounted.null).log_evidence

@@ -33,6 +33,7 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "sensor": ("y",),
     "body_sensor": ("y",),
     "passive_sensor": ("y",),
+    "recorded_input": ("y",),
     "reading_in_air": ("y",),
     "position_sensor": ("y",),
     "displacement": ("y",),

@@ -256,7 +256,7 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 
 
 # Places where an effect is an error of a reading.
-ERRORS = ("sensor", "body_sensor", "passive_sensor", "position_sensor")
+ERRORS = ("sensor", "body_sensor", "passive_sensor", "recorded_input", "position_sensor")
 FAULTS = (*ERRORS, "reading_in_air")  # places that a trusted reading is not (`Plant.trusts`)
 PLACES = {
     "node": lambda rig: _nodes(_storing(rig), "n"),
@@ -272,6 +272,7 @@ PLACES = {
     "sensor": _sensors,
     "body_sensor": lambda rig: (p for p in _sensors(rig) if p.where != rig.air),
     "passive_sensor": _passive,
+    "recorded_input": lambda rig: (p for p in _sensors(rig) if p.input),
     "reading_in_air": _in_moving_air,
     "position_sensor": lambda rig: _sensors(rig, "length"),
     "displacement": _displacements,
