@@ -19,7 +19,7 @@ from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
-from thermoctl.diagnosis.law.propose import Proposal, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (
@@ -63,8 +63,11 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         if parent is not alone and only_noise(case, parent.fitted, limits):
             continue
         say("looking for a law")
-        ahead, quiet = s.best.score - parent.score, only_noise(case, s.best.fitted, limits)
-        goal = Goal(ahead - NEAR, NEAR, True) if quiet else Goal(ahead - BEATEN, 0.0, False)
+        quiet, many = only_noise(case, s.best.fitted, limits), len(parent.fitted.hypothesis.effects)
+        rivals = [s.best if quiet else _leading(s, many + k + 1) for k in range(TERMS)]
+        near = NEAR if quiet else BEATEN
+        least = tuple(w.score - parent.score - near for w in rivals)
+        goal = Goal(least, NEAR if quiet else 0.0, quiet)
         done = case.budget.fits_done
         _compete(s, _laws(case, parent, alone, goal, limits, say), done)
     found = any(key[0] == LAW for key in s.best.fitted.hypothesis.keys)
@@ -76,14 +79,29 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
 
 
 def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
-    """Add laws to a search, and extend them where one leads.
+    """Add laws to a search, and extend one that leads the hypotheses with no more terms and effects.
 
-    Their refits, those since `done`, take none from the catalogue."""
+    Effects that imitate a law may be ahead of it with one more. Its refits, those since `done`, take none
+    from the catalogue."""
     s.case.budget.fits += s.case.budget.fits_done - done
+    before = s.best
     s.keep(laws)
-    if s.best in laws:
+    for w in laws:
+        if w is _leading(s, _size(w)):
+            s.extended(w)
+    if s.best is not before:
         grow(s)
         swap(s)
+
+
+def _size(w: Weighed) -> int:
+    """Return the number of effects of a hypothesis, each term of a law counted as one."""
+    return sum(len(e.proposal.terms) if isinstance(e, PlacedLaw) else 1 for e in w.fitted.hypothesis.effects)
+
+
+def _leading(s: Search, size: int) -> Weighed:
+    """Return the likeliest hypothesis of at most this size."""
+    return max((w for w in s.tried.values() if _size(w) <= size), key=lambda w: w.score)
 
 
 def _pays(case: Case, best: Weighed, limits: Thresholds) -> bool:
@@ -140,7 +158,7 @@ def _laws(
     def refitted(base: Weighed, some: Sequence[Proposal]) -> list[tuple[Proposal, Weighed]]:
         """Return the laws that were refitted beside a hypothesis."""
         more = parent.score - base.score
-        tried = refits(case, base.fitted, some, replace(goal, least=goal.least + more), say)
+        tried = refits(case, base.fitted, some, replace(goal, least=tuple(x + more for x in goal.least)), say)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
     groups = [(parent, refitted(parent, proposals))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -37,11 +37,11 @@ SEEN = 0.01  # least singular value of a direction of the free function that is 
 class Goal:
     """The odds that a law has to reach.
 
-    - `least`: log posterior odds against the hypothesis that it is added to
+    - `least`: log posterior odds against the hypothesis that it is added to, by its number of terms
     - `near`: nats below the best law so far, from which a law is not worth a refit
     - `quiet`: the best hypothesis leaves only noise. Then a few refits tell how far promises are trusted"""
 
-    least: float
+    least: tuple[float, ...]
     near: float
     quiet: bool
 
@@ -137,15 +137,16 @@ def refits(
     hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
     tried = list[tuple[Proposal, Fitted]]()
     queue, more = list(proposals), SIMPLER
-    goal, ratios = replace(goal, least=max(goal.least, 0.0)), list[float]()
-    leader, left, ahead = parent, affordable(case, parent), goal.least
+    ratios = list[float]()
+    leader, left, ahead = parent, affordable(case, parent), max(goal.least[0], 0.0)
 
     def wanted(p: Proposal) -> bool:
         """Return whether a law may still be the best, and a refit is left for it."""
         nonlocal left
         sure = goal.quiet and len(ratios) >= SURE
         reach = SPREAD * max(ratios) if sure else HALF * max([1.0, *ratios])
-        if not left or case.budget.stopped() or p.cost + goal.least > reach * p.promise:
+        least = max(goal.least[len(p.terms) - 1], ahead - goal.near, 0.0)
+        if not left or case.budget.stopped() or p.cost + least > reach * p.promise:
             return False
         left -= 1
         return True
@@ -163,7 +164,6 @@ def refits(
                 tried.append((p, f))
             best = more_evidence - p.cost >= ahead
             ahead = max(ahead, more_evidence - p.cost)
-            goal = replace(goal, least=max(goal.least, ahead - goal.near))
             if len(p.terms) > 1 and more and (f.doubtful or at_bound(f) or best):
                 simpler = simpler_law(p, f)
                 if simpler.kind not in {q.kind for q in queue}:
