@@ -107,6 +107,8 @@ _TOKEN = re.compile(
     r"\s*(?:(?P<power>\*\*|\^)|(?P<op>[*/()·])|(?P<raised>[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)|"
     r"(?P<number>[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)|(?P<symbol>[^\W\d]\w*|%|°C|°))"
 )
+_COMMON_PART = re.compile(r"([*/]?)(%|1|[A-Za-zµ]\w*)(?:(?:\*\*|\^)(\d+(?:\.\d+)?))?")
+_COMMON_UNIT = re.compile(f"(?:{_COMMON_PART.pattern})+")
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _WRITTEN = {"kg m2 s-2": "J", "kg m2 s-3": "W", "kg m s-2": "N", "kg m2 s-3 A-1": "V", "kg m2 s-3 A-2": "ohm"}
 _MAX_LENGTH, _MAX_EXPONENT = 100, 100
@@ -172,6 +174,19 @@ def ratio(given: str, wanted: str) -> Fraction | None:
             return None
         factor *= (Fraction(size) / per) ** power
     return factor if len(ours) == len(theirs) <= 2 else None
+
+
+def size_of(unit: str) -> float | None:
+    """Return the size of a unit of common symbols in SI units, a degree as a kelvin; None for any other."""
+    if not _COMMON_UNIT.fullmatch(unit):
+        return None
+    size = 1.0
+    for sign, symbol, power in _COMMON_PART.findall(unit):
+        one = 1.0 if symbol in ("degC", "delta_degC") else float(SYMBOLS.get(symbol, ("", 0))[1])
+        if not one:
+            return None
+        size *= one ** (float(power or 1) * (-1 if sign == "/" else 1))
+    return size
 
 
 def _spelled(unit: str) -> str:

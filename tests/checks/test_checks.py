@@ -9,6 +9,7 @@ import pytest
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
 from thermoctl.checks.commands import report
+from thermoctl.cli import main
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -160,6 +161,62 @@ def test_a_plant_without_units_is_found():
     _, table = rig("one block")
     bare = re.sub(r",? ?unit: [^,}]+", "", PLANTS["one block"]).replace("{,", "{").replace("{ ", "{")
     assert [f.kind for f in checks(loads(bare), [table])] == ["no units"]
+
+
+CART = """\
+format: thermoctl-plant/1
+title: A cart on a spring, pulled by a coil
+inputs: {i: {unit: A}}
+parameters:
+  m: {value: 0.2, unit: kg, range: [0.1, 0.5]}
+  k: {value: 600, unit: N/m, range: [200, 2000]}
+  d: {value: 4, unit: N*s/m, range: [0.1, 20]}
+  Kf: {value: 8, unit: N/A}
+  R: {value: 2, unit: ohm}
+nodes: {v: {unit: m/s, storage: m, initial: 0}, p: {unit: m, storage: 1, initial: 0}}
+flows:
+  force: {into: v, rate: Kf * i, unit: N}
+  spring: {from: v, rate: k * p, unit: N}
+  damper: {from: v, rate: d * v, unit: N}
+  motion: {into: p, rate: v, unit: m/s}
+outputs:
+  u: {value: R * i + Kf * v, unit: V, noise: 0.01}
+  x: {value: 1000 * p, unit: mm, noise: 0.01}
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ("value: 1000 * p,", "value: p,", "the value of 'x' is stated in mm, but 'p' has a unit of 1000 mm"),
+        (
+            "rate: Kf * i, unit: N",
+            "rate: Kf * i, unit: kN",
+            "'force' is stated in kN, but 'Kf * i' has a unit of 0.001 kN",
+        ),
+        (
+            "rate: k * p, unit: N",
+            "rate: k * p, unit: mN",
+            "'spring' is stated in mN, but 'k * p' has a unit of 1000 mN",
+        ),
+    ],
+)
+def test_an_expression_that_nothing_converts(right, wrong, words, tmp_path, capsys):
+    """Units are checked by dimension, so m fits in place of mm: what no number converts is told, and data prove it."""
+    sound, _ = loads(CART), loads(CART.replace(right, wrong))
+    t = np.arange(1500) / 500
+    u = np.repeat(np.random.default_rng(0).normal(size=30), 50)
+    y = compile_plant(sound).simulate(Table("r", "r.csv", t, {"i": u})).y
+    noisy = y + np.random.default_rng(1).normal(0, 0.01, y.shape)
+    table = Table("r", "r.csv", t, {"i": u, "u": noisy[:, 0], "x": noisy[:, 1]})
+    assert not checks(sound, [table])
+    (tmp_path / "plant.yaml").write_text(CART.replace(right, wrong))
+    assert main(["plant", "check", str(tmp_path / "plant.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert words in told and "warning" in told and "plant.yaml:" in told
+    found = checks(loads(CART.replace(right, wrong)), [table])
+    stated = [f for f in found if words in f.what]
+    assert len(stated) == 1 and stated[0].severe == (wrong == "value: p,")
 
 
 RADIATION = (

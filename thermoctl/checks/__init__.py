@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from thermoctl.checks.data import data_findings
+from thermoctl.checks.file import unconverted
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import label_findings
 from thermoctl.checks.model import plant_findings, start_findings
@@ -31,7 +32,7 @@ def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
     excitations = [model.excitation(t) for t in tables]
     if text := next(filter(None, (outputs_lacking(plant, t) for t in tables)), ""):
         raise InputError(text)
-    findings = plant_findings(model, excitations)
+    findings = [*plant_findings(model, excitations), *(f for f, _ in unconverted(plant))]
     for table, excitation in zip(tables, excitations, strict=True):
         findings += data_findings(model, table, excitation)
     if not any(f.severe for f in findings):
@@ -39,4 +40,5 @@ def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
         findings += labels
         for table in cleared:
             findings += start_findings(model, model.excitation(table))
-    return sorted(findings, key=lambda f: not f.severe)
+    order = sorted(findings, key=lambda f: not f.severe)
+    return list({f.what: f for f in reversed(order)}.values())[::-1]  # each once, the severe one

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,15 +13,68 @@ from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
 from thermoctl.plant.language import Flow, Input, Node
+from thermoctl.units import size_of
 
 _TEMPERATURES = ("degC", "K", "degF")
 POINTS = 3  # random values at which an expression is tried
+SAME = 1e-6  # relative error of equal sizes of units
 HOMOGENEOUS = 1e-9  # relative error of Euler's theorem
 
 
 def file_findings(plant: Plant) -> list[Finding]:
     """Return warnings of a plant file; no recording is needed."""
-    return [*unit_findings(plant), *_storages(plant), *_signs(plant), *_scales(plant)]
+    return [
+        *unit_findings(plant),
+        *(f for f, _ in unconverted(plant)),
+        *_storages(plant),
+        *_signs(plant),
+        *_scales(plant),
+    ]
+
+
+def unconverted(plant: Plant) -> Iterator[tuple[Finding, Plant]]:
+    """Yield a warning for each expression in another unit than its place states, and the plant corrected.
+
+    Units are checked by dimension: a position in m that is read in mm fits, but nothing makes it 1000 times
+    larger. An expression with a number, but an exponent, may convert."""
+    named = [*plant.readings(), *plant.parameters.values(), *plant.nodes.values()]
+    sizes = {i.name: size_of(i.unit) if i.unit else None for i in named} | {"t": 1.0}
+    for o in plant.outputs.values():
+        if factor := _unconverted(o.value, o.unit, sizes):
+            right = replace(o, value=ex.mul(ex.num(factor), o.value))
+            finding = _finding(plant, f"the value of '{o.name}'", o.value, o.unit, o.at, factor)
+            yield finding, replace(plant, outputs={**plant.outputs, o.name: right})
+    for f in plant.flows.values():
+        if factor := _unconverted(f.rate, f.unit, sizes):
+            turned = replace(f, rate=ex.mul(ex.num(factor), f.rate))
+            finding = _finding(plant, f"the rate of '{f.name}'", f.rate, f.unit, f.at, factor)
+            yield finding, replace(plant, flows={**plant.flows, f.name: turned})
+
+
+def _finding(plant: Plant, what: str, e: Expr, unit: str | None, at: str, factor: float) -> Finding:
+    told = f"{what} is stated in {unit}, but '{e}' has a unit of {factor:.6g} {unit}, and nothing converts it"
+    todo = f"Multiply it by {factor:.6g}, or state the unit that it has."
+    return Finding("unit", f"{plant.file}:{at}", told, todo, severe=False)
+
+
+def _unconverted(e: Expr, unit: str | None, sizes: Mapping[str, float | None]) -> float | None:
+    """Return the size of an expression's unit in the stated one; None if equal, unknown or converted."""
+    size = size_of(unit) if unit else None
+    known = {q: sizes.get(q) for q in ex.names(e)}
+    exponents = {p for q in ex.walk(e) if q.op == "**" for p in ex.walk(q.args[1])}
+    numbers = [q for q in ex.walk(e) if q.op in ("num", "fmu", "table", "first") and q not in exponents]
+    if size is None or not known or numbers or None in known.values():
+        return None
+    factors = []
+    for seed in range(POINTS):
+        values = dict(
+            zip(sorted(known), np.random.default_rng(seed).uniform(0.5, 2.0, len(known)), strict=True)
+        )
+        in_si = {q: v * float(known[q] or 1.0) for q, v in values.items()}
+        with np.errstate(all="ignore"):
+            factors.append(float(np.divide(value_of(e, in_si), value_of(e, values))) / size)
+    same = np.isfinite(factors).all() and np.allclose(factors, factors[0], SAME, 0)
+    return factors[0] if same and not np.isclose(factors[0], 1.0, SAME, 0) else None
 
 
 def _values(plant: Plant, seed: int = 0) -> dict[str, float]:

@@ -22,7 +22,7 @@ from math import log
 import numpy as np
 
 from thermoctl.checks.data import driving_inputs, moves
-from thermoctl.checks.file import driving_away
+from thermoctl.checks.file import driving_away, unconverted
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.model import NYQUIST, rates_of
 from thermoctl.plant.fitting.refit import fit
@@ -91,6 +91,9 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
     if now is None or np.all(now.rms <= CLOSE * now.noise):
         return None
     hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables), *_turned(model.plant)]
+    for f, right in unconverted(model.plant):
+        todo = f"{f.suggestion.removesuffix('.')}: {f.where}."
+        hypotheses.append(Hypothesis(f.kind, f.what, todo, plant=right))
     proof = log(RARITY * max(len(hypotheses), 1))
     screened: list[tuple[float, Hypothesis]] = []
     plain = _screened(model, tables)
