@@ -239,7 +239,9 @@ def test_the_ambient_that_most_losses_are_counted_from_is_taken_and_said():
 
 def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     plant = loads(OSCILLATOR)
-    columns = {n: np.arange(5.0) for n in ("drive", "motor_speed", "position", "current", "x", "v", "c7")}
+    columns = {
+        n: np.arange(5.0) ** 2 for n in ("drive", "motor_speed", "position", "current", "x", "v", "c7")
+    }
     drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
     structure = Rig(plant, [drive], [columns])
     assert structure.signals("v") == ["slope"], "the plant's own motion comes first"
@@ -248,3 +250,10 @@ def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     notes = structure.guesses()
     assert any("'current': it may be a current; " in n for n in notes)
     assert any("'c7': it may be a temperature; " in n for n in notes)
+    units = {"pos_mm": "position", "gap_um": "position", "spindle_rpm": "velocity", "i_d": "current"}
+    units["possible"] = "temperature"
+    columns = {n: np.arange(5.0) ** 2 for n in ("drive", *units)} | {"t_ms": 1000 * np.arange(5.0) + 7}
+    drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
+    notes = Rig(plant, [drive], [columns]).guesses()
+    assert all(any(f"'{n}': it may be a {kind}; " in note for note in notes) for n, kind in units.items())
+    assert not any("t_ms" in note for note in notes), "the time in another unit is no quantity of the rig"

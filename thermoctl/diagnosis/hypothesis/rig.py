@@ -34,7 +34,12 @@ RATES, PLACES = ("", *MOVING, *FLOWING, "voltage"), ("", "length", "voltage")
 JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
 # Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
 # has a note about each guess.
-SOUNDS = {"v": r"veloc|speed|^v$", "x": r"posit|stroke|travel|^x$", "i": r"current|^i$", "T": r"temp|_c$|^t_"}
+SOUNDS = {
+    "v": r"veloc|speed|rpm|^v$|^vel(_|$)|_vel(_|$)",
+    "x": r"posit|stroke|travel|^x$|^pos(_|$)|_pos(_|$)|_[mu]m$",
+    "i": r"current|^i(_|$)",
+    "T": r"temp|_c$|^t_",
+}
 MEANINGS = {"v": "velocity", "x": "position", "i": "current", "T": "temperature"}
 
 _KINDS = {
@@ -104,6 +109,14 @@ def _motions(plant: Plant) -> dict[str, str]:
     }
 
 
+def _is_clock(d: Excitation, column: np.ndarray) -> bool:
+    """Return whether a column is the recording's time, from any zero and in any unit."""
+    if len(column) != len(d.t) or len(d.t) < 3 or not np.isfinite(column).all():
+        return False
+    passed = (column - column[0]) * (d.t[-1] - d.t[0])
+    return bool(np.allclose(passed, (d.t - d.t[0]) * (column[-1] - column[0]), 1e-6, 1e-6 * abs(passed[-1])))
+
+
 class Rig:
     """A plant and its recordings, with the kinds of its quantities.
 
@@ -160,11 +173,12 @@ class Rig:
         common = set.intersection(*(set(c) for c in self.columns)) if self.columns else set()
         read = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
         known = {*p.nodes, *p.parameters, *p.outputs, *p.inputs, *p.flows}
-        return [
+        moving = [
             c
             for c in common - read - known
             if all(np.isfinite(t[c]).any() and np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in self.columns)
         ]
+        return [c for c in moving if not all(map(_is_clock, self.drives, (t[c] for t in self.columns)))]
 
     def kind(self, q: Input | Node | Output) -> str:
         """Return the kind of a quantity: from its role, its motion, the node that it reads, or its unit."""
