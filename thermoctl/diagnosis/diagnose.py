@@ -120,6 +120,7 @@ def decided(sought: Sought) -> Diagnosis:
         named=named,
         over_noise=max(after.over_noise.values()),
         worth=_ratio(value.after, value.refit_only) if checked else 1.0,
+        apart=max((rms / value.noise[o] for o, rms in value.after.items()), default=0.0) if checked else 0.0,
         remains=remains,
         worse=value.worse if checked else 0.0,
         flow=unknown.probability,

@@ -36,7 +36,8 @@ class Facts:
     - `worth`: held-out error with the findings, divided by that of the refitted plant
     - `worse`: probability that the held-out error is larger with the findings
     - `remains`: the largest probability of a remainder at an output
-    - `flow`: probability that a flow is missing which no output shows alone"""
+    - `flow`: probability that a flow is missing which no output shows alone
+    - `apart`: the largest ratio of an error on recordings set aside to its sensor's noise; 0 without them"""
 
     something: float
     known: float
@@ -46,6 +47,7 @@ class Facts:
     worse: float = 0.0
     remains: float = 0.0
     flow: float = 0.0
+    apart: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,11 @@ ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
         "unexplained",
     ),
     ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
-    ("findings are supported and the residual is the sensors' noise", _only_noise, "explained"),
+    (
+        "findings are supported and the residual is the sensors' noise",
+        lambda f, q: _only_noise(f, q) and f.apart <= q.clean,
+        "explained",
+    ),
     ("findings are supported and a remainder stays beside them", lambda f, q: True, "partly_explained"),
 )
 
