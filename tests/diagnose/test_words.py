@@ -56,6 +56,20 @@ FOUND = {
 }
 
 
+@pytest.mark.parametrize(("probability", "told"), [(0.87, True), (0.4, False)])
+def test_what_is_rather_likely_is_told_where_nothing_is_named(probability, told):
+    eddy = {
+        "effect": "eddy_heating",
+        "where": "stator",
+        "when": None,
+        "probability": probability,
+        "parameters": {},
+    }
+    text = sentences({**FOUND, "verdict": "unexplained", "findings": [], "alternatives": [eddy]})[0]
+    assert text.startswith("Something is missing")
+    assert ("Rather likely, but no sure name: eddy heating at stator (0.87)." in text) == told
+
+
 def test_findings_are_told_by_size_with_units():
     first, gain, rest = sentences(FOUND)
     assert (

@@ -294,12 +294,17 @@ def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, 
     x, (first, *others) = best.excitation, comparison.predictors
     hours = x.duration_s / 3600
     sigmas = np.sqrt(best.distances[0, 1:])
+    does = (
+        "It would set"
+        if best.bits >= LEAST_BITS
+        else "No experiment that was tried tells them apart: the best sets"
+    )
     inputs = {n: c.tolist() for n, c in x.corners.items()} | {
         n: [[0.0, v]] for n, v in x.starts.items() if n in comparison.case.plant.inputs
     }
     return {
         "profile": x.title,
-        "why": f"It would set {first.label} apart from {others[int(np.argmin(sigmas))].label} by {sigmas.min():.1f} "
+        "why": f"{does} {first.label} apart from {others[int(np.argmin(sigmas))].label} by {sigmas.min():.1f} "
         f"standard errors, after what their parameters are still uncertain by ({best.bits:.2f} bits in {hours:.3g} h; "
         f"best per hour of {candidates} candidates).",
         "also_helpful": None if np.all(sigmas**2 >= DECIDES) else _sensor(comparison, best),

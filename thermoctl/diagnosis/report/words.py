@@ -24,6 +24,7 @@ WORSE = (
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
 LIKELY = 0.05  # least probability that something is missing, or an effect, that is worth a word
+RATHER = 0.5  # least probability of an alternative that is mentioned where nothing is named
 # Least held-out error, extended over refitted, that speaks against the extended plant. Of 306 outputs of 100
 # diagnoses with findings the largest was 1.07.
 CLEARLY = 1.5
@@ -158,6 +159,10 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
         return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
     doubted = listed([name(a) for a in result["alternatives"] if a.get("why_not")][:2])
     fits = f" What would fit, though nothing else confirms it: {doubted}." if doubted else ""
+    rather = [a for a in result["alternatives"] if a["probability"] >= RATHER]
+    if rather and not doubted:
+        told = listed([f"{name(a)} ({chance(a['probability'])})" for a in rather])
+        fits = f" Rather likely, but no sure name: {told}."
     if _small(rows):
         what = "A small systematic error stays"
     elif max(result["decision"].get(k, 1.0) for k in ("something", "remains", "flow")) < LIKELY:
