@@ -123,6 +123,7 @@ def test_what_is_left_of_the_best_meets_its_own_rivals(monkeypatch):
     s.known[frozenset()] = {"g": 40.0, "t": 80.0}  # with the gain of r, the promise of t reaches the best
     monkeypatch.setattr(beam, "rebuilt", lambda s, rest, *a: weighed(rest[0].key[0], 70.0))
     monkeypatch.setattr(beam, "simplified", lambda s: [])
+    monkeypatch.setattr(beam, "cleared", lambda s: [])
     beam.swap(s)
     assert s.best.fitted.hypothesis.keys == {("t", PLACE)}
 
@@ -164,3 +165,30 @@ def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
     assert simple.fitted.plant.parameters["F_coulomb_friction_velocity"].value == pytest.approx(1.2, rel=0.02)
     s.keep([simple])
     assert not beam.simplified(s)
+
+
+def test_an_effect_that_is_nothing_is_not_ahead_of_a_worse_refit_of_the_others():
+    """A free stage with friction and cogging: their refit had ended far off, and a third effect of no size was named."""
+    t = np.arange(3000) * 0.002
+    truth = SPRING_STAGE.replace(
+        "damper:", "rub: {from: velocity, rate: 1.2 * tanh(velocity / 0.001)}\n  damper:"
+    )
+    force = Table("run", "run", t, {"force": 6 * np.sin(7 * t) + 3 * np.sin(23 * t)})
+    table = compile_plant(loads(truth)).measure(force, seed=1)
+    known = case(loads(SPRING_STAGE), [table], catalogue(), Budget(20))
+    s, plant, placed = beam.started(known, limits()), known.plant, ()
+    for key, values, ranges in (
+        (("coulomb_friction", "velocity"), {"W": 1e-3, "F": 1.1}, {"W": (1e-5, 0.1), "F": (0.0, 4.0)}),
+        (("constant_load", "velocity"), {"F": 0.01}, {"F": (-4.0, 4.0)}),
+    ):
+        rig = known.rig(plant, known.drives(compile_plant(plant)))
+        c = next(c for c in candidates(rig, known.catalogue) if c.key == key)
+        plant = c.extend(values, ranges)
+        placed = (*placed, Placed(c, {p: c.own(p) for p in values}))
+        f = fitted(known, plant, placed)
+        s.keep([Weighed(f, s.weighed(f).log_odds - 1000.0 * (len(placed) == 1))])  # the first is far off
+    assert [e.key[0] for e in s.best.fitted.hypothesis.effects] == ["coulomb_friction", "constant_load"]
+    (rest,) = beam.cleared(s)
+    assert rest.fitted.hypothesis.keys == {("coulomb_friction", "velocity")} and rest.score > s.best.score
+    s.keep([rest])
+    assert not beam.cleared(s)

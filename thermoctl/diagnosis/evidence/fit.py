@@ -115,6 +115,12 @@ def _insignificant(f: Fitted, e: Placed, which: Amplitudes) -> bool:
     return which(f, e, sizes)
 
 
+def near_nothing(f: Fitted, e: Placed) -> bool:
+    """Return whether each amplitude of an effect is within SIGNIFICANT sd of no effect; False without one."""
+    sizes = [p for p in e.candidate.effect.parameters if p.amplitude and e.own.get(p.name) in f.sd]
+    return bool(sizes) and all(_near_null(f, e, p) for p in sizes)
+
+
 def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
     """Return whether a parameter is within SIGNIFICANT sd of the value at which it changes nothing."""
     return abs(_distance(f, e, p)) < SIGNIFICANT

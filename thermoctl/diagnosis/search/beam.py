@@ -10,7 +10,15 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Budget, Case
 from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
-from thermoctl.diagnosis.evidence.fit import WHITE, Fitted, Placed, as_refitted, fitted, placed_before
+from thermoctl.diagnosis.evidence.fit import (
+    WHITE,
+    Fitted,
+    Placed,
+    as_refitted,
+    fitted,
+    near_nothing,
+    placed_before,
+)
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, found_again
@@ -212,7 +220,7 @@ def swap(s: Search) -> None:
     them. The rest is refitted even if the budget is spent: misfit.py compares the effect with it. Where it is
     the best, promises were compared without its gain: the rest of each of its effects is extended again."""
     while True:
-        s.keep(simplified(s))
+        s.keep([*simplified(s), *cleared(s)])
         best = s.best
         effects = best.fitted.hypothesis.effects
         # the rest of a single effect is the plant alone, which is extended first of all
@@ -250,6 +258,23 @@ def simplified(s: Search) -> list[Weighed]:
             found.append(w)
         else:
             s.refuse(keys, w.fitted if w else None)
+    return found
+
+
+def cleared(s: Search) -> list[Weighed]:
+    """Refit the best hypothesis without an effect that is near nothing, from its values.
+
+    A refit of the others that ended in a wrong optimum may be all that such an effect is ahead of. The refit
+    in white noise may have ended there, too."""
+    best, found = s.best, list[Weighed]()
+    values = dataclasses.replace(best.fitted, rough_plant=best.fitted.plant)
+    for e in best.fitted.hypothesis.effects:
+        rest = tuple(o for o in best.fitted.hypothesis.effects if o is not e)
+        known = s.tried.get(frozenset(o.key for o in rest))
+        if not rest or not known or known.score > best.score - SURPLUS or s.case.budget.stopped():
+            continue
+        if near_nothing(best.fitted, e) and (w := rebuilt(s, rest, values, best.fitted)):
+            found.append(w)
     return found
 
 
