@@ -182,7 +182,7 @@ def size_of(unit: str) -> float | None:
         return None
     size = 1.0
     for sign, symbol, power in _COMMON_PART.findall(unit):
-        one = 1.0 if symbol in ("degC", "delta_degC") else float(SYMBOLS.get(symbol, ("", 0))[1])
+        one = 1.0 if symbol == "degC" else float(SYMBOLS.get(symbol, ("", 0))[1])
         if not one:
             return None
         size *= one ** (float(power or 1) * (-1 if sign == "/" else 1))

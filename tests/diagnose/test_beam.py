@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.plants import SPRING_STAGE
-from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
@@ -139,6 +139,17 @@ def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, prom
     assert not shortlist.elsewhere({("radiation", "there"), ("drift", "here")}, 60.0, looked, [])
 
 
+def rubbed() -> Case:
+    """Return a case of a spring stage whose dry friction of 1.2 N is missing."""
+    t = np.arange(3000) * 0.002
+    truth = SPRING_STAGE.replace(
+        "damper:", "rub: {from: velocity, rate: 1.2 * tanh(velocity / 0.001)}\n  damper:"
+    )
+    force = Table("run", "run", t, {"force": 6 * np.sin(7 * t) + 3 * np.sin(23 * t)})
+    table = compile_plant(loads(truth)).measure(force, seed=1)
+    return case(loads(SPRING_STAGE), [table], catalogue(), Budget(20))
+
+
 @pytest.mark.parametrize(
     ("richer", "sizes"),
     [
@@ -148,13 +159,7 @@ def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, prom
 )
 def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
     """Beside cogging, dry friction promised too little for a refit: a friction that contains it was named."""
-    t = np.arange(3000) * 0.002
-    truth = SPRING_STAGE.replace(
-        "damper:", "rub: {from: velocity, rate: 1.2 * tanh(velocity / 0.001)}\n  damper:"
-    )
-    force = Table("run", "run", t, {"force": 6 * np.sin(7 * t) + 3 * np.sin(23 * t)})
-    table = compile_plant(loads(truth)).measure(force, seed=1)
-    known = case(loads(SPRING_STAGE), [table], catalogue(), Budget(20))
+    known = rubbed()
     s = beam.started(known, limits())
     rig = known.rig(known.plant, known.drives(known.null.model))
     c = next(c for c in candidates(rig, known.catalogue) if c.key == (richer, "velocity"))
@@ -169,13 +174,7 @@ def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
 
 def test_an_effect_that_is_nothing_is_not_ahead_of_a_worse_refit_of_the_others():
     """A free stage with friction and cogging: their refit had ended far off, and a third effect of no size was named."""
-    t = np.arange(3000) * 0.002
-    truth = SPRING_STAGE.replace(
-        "damper:", "rub: {from: velocity, rate: 1.2 * tanh(velocity / 0.001)}\n  damper:"
-    )
-    force = Table("run", "run", t, {"force": 6 * np.sin(7 * t) + 3 * np.sin(23 * t)})
-    table = compile_plant(loads(truth)).measure(force, seed=1)
-    known = case(loads(SPRING_STAGE), [table], catalogue(), Budget(20))
+    known = rubbed()
     s, plant, placed = beam.started(known, limits()), known.plant, ()
     for key, values, ranges in (
         (("coulomb_friction", "velocity"), {"W": 1e-3, "F": 1.1}, {"W": (1e-5, 0.1), "F": (0.0, 4.0)}),

@@ -15,7 +15,8 @@ from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
-from thermoctl.plant import load
+from thermoctl.plant import load, loads
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 C, G, AIR, EVERY_S = 4.8, 0.06, 20.0, 2.0
@@ -83,6 +84,23 @@ def test_a_heater_that_is_logged_a_row_late_is_said_to_be_late(tmp_path):
     assert contract(d)["verdict"] == "explained"
     values = d.best.plant.parameters
     assert values["C"].value == pytest.approx(C, rel=0.01) and values["G"].value == pytest.approx(G, rel=0.01)
+
+
+@pytest.mark.parametrize(("late", "rows"), [("heat", 2), ("air", 3), ("heat", 0)])
+def test_an_input_on_straight_lines_that_is_late_is_named_too(late, rows):
+    """A measured ramp of the heater, and the room; where none is late, nothing is missing."""
+    plant, runs = loads(ONE_BLOCK.replace("heat: {unit: W}", "heat: {unit: W, between_samples: linear}")), []
+    for seed in (1, 2):
+        rng, t = np.random.default_rng(seed), np.arange(0, 1200, EVERY_S)
+        ramps = (rng.uniform(0, 6, 33), 20 + rng.uniform(-4, 4, 33))
+        u = {n: np.interp(t, np.arange(33) * 40.0, x) for n, x in zip(("heat", "air"), ramps, strict=True)}
+        y = compile_plant(plant).simulate(Table("run", "run", t, u), {"C": C, "G": G}).y[:, 0]
+        u[late] = np.concatenate([np.full(rows, u[late][0]), u[late]])[: len(t)]
+        runs.append(Table(f"run_{seed}", "run", t, u | {"temperature": y + rng.normal(0, 0.1, len(t))}))
+    found = contract(diagnose(plant, runs, catalogue(), limits()))["findings"]
+    assert [(f["effect"], f["where"]) for f in found] == [("sensor_advance", late)] * bool(rows)
+    for p in (p for f in found for p in f["parameters"].values()):
+        assert p["value"] == pytest.approx(rows * EVERY_S, abs=3 * p["sd"]) and p["sd"] < 0.3
 
 
 @pytest.mark.slow  # half a minute: two diagnoses

@@ -168,6 +168,16 @@ RULES: Mapping[str, Rule] = {
         {"search.beam.with_observer": _no},
         searches=True,
     ),
+    "near nothing": Rule(
+        "an effect of no size is left out where the others fit as well from its values",
+        {"search.beam.cleared": _none},
+        searches=True,
+    ),
+    "its size": Rule(
+        "a law that leads the hypotheses of its size is extended, though larger ones are ahead",
+        {"law.contest._leading": lambda s, size: s.best},
+        searches=True,
+    ),
     "surplus": Rule(
         "an extension with an insignificant part is kept from 5 nats over the others",
         {"search.beam.SURPLUS": float("inf")},

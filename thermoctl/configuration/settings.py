@@ -72,7 +72,12 @@ class LoopSettings:
 
     period_s: float = option("period of the tick", 0.001, "s", 2e-4, 0.1, restart=True)
     cpu: int = option(
-        "processor that runs the loop; -1 leaves the choice to the scheduler", -1, "1", -1, 1023, restart=True
+        "number of the processor that runs the loop; -1 leaves the choice to the scheduler",
+        -1,
+        "1",
+        -1,
+        1023,
+        restart=True,
     )
     priority: int = option(
         "SCHED_FIFO priority of the loop; 0 switches real-time scheduling off", 80, "1", 0, 99, restart=True
@@ -95,7 +100,9 @@ class LoopSettings:
         choices=("clock", "device", "tick"),
     )
     reference: bool = option(
-        "run an idle loop beside the control loop; `thermoctl latency` compares both", False, restart=True
+        "run an idle loop with the same clock beside the control loop; `thermoctl latency` compares both",
+        False,
+        restart=True,
     )
 
 
@@ -120,7 +127,11 @@ class ControlSettings:
         high=1e6,
     )
     setpoint_rate_um_s: float = option(
-        "largest speed towards a new setpoint (default: 1 mm/min)", 1000.0 / 60.0, "um/s", 1e-3, 1e6
+        "largest speed of the reference on its way to a new setpoint (default: 1 mm/min)",
+        1000.0 / 60.0,
+        "um/s",
+        1e-3,
+        1e6,
     )
     setpoint_low_um: float = option("smallest setpoint that is accepted", -1e6, "um", -1e6, 1e6)
     setpoint_high_um: float = option("largest setpoint that is accepted", 1e6, "um", -1e6, 1e6)
@@ -250,7 +261,9 @@ class HalSettings:
     )
     drive_input: str = option("name of the plant's input that the amplifier drives", "drive", restart=True)
     inputs: Node | None = option(
-        "course of other plant inputs: name: {mean, swing, period_s, noise, resolution}", None, restart=True
+        "course of the other plant inputs: name: {mean, swing, period_s, noise, resolution}",
+        None,
+        restart=True,
     )
     roles: dict[str, str] = option(
         "channel role of each plant output whose name is not a role: output: role", factory=dict, restart=True

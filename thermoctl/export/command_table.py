@@ -15,7 +15,9 @@ TABLE: Table = {
             argument("--to", required=True, choices=["fmu", "modelica", "python", "c"], help="the language"),
             option("--out", "FILE", "the file (default: the plant's name with the language's ending)"),
             option(
-                "--data", "REC", "a recording: first readings, its own parameters, and the widths of jumps"
+                "--data",
+                "REC",
+                "a recording: first readings, this recording's parameters, and the widths of jumps",
             ),
             *READING,
         ),

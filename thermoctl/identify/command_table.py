@@ -18,7 +18,11 @@ TABLE: Table = {
             option("--points", "FILE", "rig file or points file with the points (default: the paper's)"),
             option("--period", "S", "the loop's period (default 0.001)", type=float, default=0.001),
             option(
-                "--sensor-period", "S", "the thermocouple's period (default 0.1)", type=float, default=0.1
+                "--sensor-period",
+                "S",
+                "the thermocouple's sampling period (default 0.1)",
+                type=float,
+                default=0.1,
             ),
             argument(
                 "--kind",

@@ -36,7 +36,10 @@ CAN: dict[str, tuple[Key, ...]] = {
     "cia402": (
         text("eds", "the drive's EDS file; none: types of standard objects, and those of `objects`", ""),
         section(
-            "objects", "types of the maker's objects without an EDS file", None, example="{'0x30D1:1': int32}"
+            "objects",
+            "types of the maker's own objects where there is no EDS file",
+            None,
+            example="{'0x30D1:1': int32}",
         ),
         whole("node_id", "node id (binding: `address`)", 1, 126, default=1),
         whole(
@@ -47,12 +50,19 @@ CAN: dict[str, tuple[Key, ...]] = {
         ),
         node("command", "object of RPDO 1 that takes the command: 0x6071, with a sub-index 0x30D1:1"),
         listed(
-            "transmit", "objects of TPDO 1, up to 8 bytes, the status word first", example="[0x6041, 0x6078]"
+            "transmit",
+            "objects of TPDO 1, at most 8 bytes, the status word 0x6041 first",
+            example="[0x6041, 0x6078]",
         ),
         listed("start_up", "further objects written at set-up", None),
         number("heartbeat_s", "period of our heartbeat and of the drive's", 1e-3, 1, "s", default=0.02),
         number(
-            "watchdog_s", "the drive stops without our heartbeat for this long", 2e-3, 10, "s", default=0.1
+            "watchdog_s",
+            "the drive stops when our heartbeat is missing for this long",
+            2e-3,
+            10,
+            "s",
+            default=0.1,
         ),
         whole("master_id", "our own node id (missing: 127 - node id)", 1, 127, default=0),
         number("sdo_timeout_s", "longest time for an answer at set-up", 0.01, 10, "s", default=0.3),

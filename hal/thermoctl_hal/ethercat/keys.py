@@ -7,7 +7,13 @@ from thermoctl_hal.base.key import Key, bits_of, flag, listed, node, number, sec
 _PLACE = (
     node("object", "an object of `transmit`; give this or `byte`", None, example="0x6041"),
     whole(
-        "byte", "first byte of the value in the inputs, from 0", 0, 1485, "byte", default=None, example="2"
+        "byte",
+        "first byte of the value in the slave's inputs, from 0",
+        0,
+        1485,
+        "byte",
+        default=None,
+        example="2",
     ),
 )
 
@@ -19,7 +25,13 @@ ETHERCAT: dict[str, tuple[Key, ...]] = {
         ),
         whole("position", "place on the cable, 1 for the first (binding: `address`)", 1, 199, default=1),
         whole(
-            "input_bytes", "size of the inputs, compared; 0: not", 0, 1486, "byte", default=0, example="16"
+            "input_bytes",
+            "size of the slave's inputs, compared at connection; 0: not compared",
+            0,
+            1486,
+            "byte",
+            default=0,
+            example="16",
         ),
         listed(
             "transmit",

@@ -17,7 +17,11 @@ MODBUS: dict[str, tuple[Key, ...]] = {
     "channel of modbus": (
         text("kind", "input (function 4), holding (3), discrete (2) or coil (1)", "input", choices=_KINDS),
         whole(
-            "register", "from 0: a manual's 40001 is kind: holding, register: 0", 0, MAX_ADDRESS, example="0"
+            "register",
+            "address from 0: a manual's 40001 is kind: holding, register: 0",
+            0,
+            MAX_ADDRESS,
+            example="0",
         ),
         text("type", "int16 .. int64, uint16 .. uint64, float32, float64, bcd16, bcd32", "int16"),
         text(

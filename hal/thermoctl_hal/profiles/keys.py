@@ -41,7 +41,14 @@ PROFILE: dict[str, tuple[Key, ...]] = {
     "drive": (
         text("unit", "unit of the command"),
         number("scale", "one count of the command", 1e-12, unit="unit", example="0.001"),
-        Key("limits", "interval", "[low, high] of every command", REQUIRED, "unit", example="[-2.5, 2.5]"),
+        Key(
+            "limits",
+            "interval",
+            "[low, high]: the largest commands ever sent",
+            REQUIRED,
+            "unit",
+            example="[-2.5, 2.5]",
+        ),
         number(
             "slew_per_s",
             "largest rate of the command; required in a position mode, where it starts from the present position",

@@ -18,7 +18,12 @@ _REQUEST = (
     ),
     number("request_hz", "requests per second", 0, 1000, "Hz", default=0.0, example="20"),
     number(
-        "answer_s", "longest time for an answer; then the next device is asked", 1e-3, 10, "s", default=0.1
+        "answer_s",
+        "longest time for an answer, after which the next device of a shared line is asked",
+        1e-3,
+        10,
+        "s",
+        default=0.1,
     ),
 )
 
@@ -29,7 +34,12 @@ SERIAL: dict[str, tuple[Key, ...]] = {
         text("parity", "none, even or odd", "N", choices=("N", "E", "O")),
         whole("stop_bits", "stop bits", 1, 2, default=1),
         whole(
-            "latency_timer_ms", "hold time of an FTDI adapter; 0 leaves it as it is", 0, 255, "ms", default=1
+            "latency_timer_ms",
+            "longest time that an FTDI adapter holds bytes back; 0 leaves it as it is",
+            0,
+            255,
+            "ms",
+            default=1,
         ),
     ),
     "frame": (
@@ -68,7 +78,10 @@ SERIAL: dict[str, tuple[Key, ...]] = {
         ),
         text("endian", "byte order, where it differs from the frame's", "", choices=("", *_ENDIAN)),
         whole(
-            "equals", "frames with another number are another device's: ignored", default=None, example="3"
+            "equals",
+            "a frame with another number here is another device's and is ignored",
+            default=None,
+            example="3",
         ),
         text("of", "instead of `type`: this field is some bits of that field", ""),
         *bits_of("that field"),
@@ -100,7 +113,12 @@ SERIAL: dict[str, tuple[Key, ...]] = {
     "channel of serial-lines": (
         text("field", "named group of the pattern"),
         whole("base", "10 or 16; required where the group also takes letters", default=10, example="16"),
-        text("sign", "group with the sign, where it stands apart: '-' is minus", "", example="s"),
+        text(
+            "sign",
+            "group with the sign, where it stands apart from the digits: '-' is minus",
+            "",
+            example="s",
+        ),
         text("unit_field", "group with the unit, where the line gives it", "", example="u"),
         section(
             "unit_factors",

@@ -294,11 +294,8 @@ def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, 
     x, (first, *others) = best.excitation, comparison.predictors
     hours = x.duration_s / 3600
     sigmas = np.sqrt(best.distances[0, 1:])
-    does = (
-        "It would set"
-        if best.bits >= LEAST_BITS
-        else "No experiment that was tried tells them apart: the best sets"
-    )
+    none = "No experiment that was tried tells them apart: the best sets"
+    does = "It would set" if best.bits >= LEAST_BITS else none
     inputs = {n: c.tolist() for n, c in x.corners.items()} | {
         n: [[0.0, v]] for n, v in x.starts.items() if n in comparison.case.plant.inputs
     }

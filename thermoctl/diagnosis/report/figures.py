@@ -26,11 +26,8 @@ COLUMNS = {
     "held_out_refit_only": "held out: refitted",
     "held_out_after": "held out: extended",
 }
-RATIOS = (
-    "over_noise",
-    "worth",
-    "apart",
-)  # numbers of a decision that are ratios; the others are probabilities
+# Numbers of a decision that are ratios; the others are probabilities.
+RATIOS = ("over_noise", "worth", "apart")
 MEANINGS = {
     "something": "probability that an effect or an unknown law is missing",
     "known": "probability that an effect is missing that other data confirm",
