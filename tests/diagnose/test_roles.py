@@ -10,11 +10,15 @@ import pytest
 import yaml
 
 from tests.diagnose.changes import Given, kelvin, milliwatt, names, order
+from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
+from thermoctl.plant import expression as ex
 from thermoctl.plant import from_plain, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -156,7 +160,7 @@ def _changes(rig: Given) -> dict[tuple, tuple[dict, dict]]:
         model.prepare(model.excitation(table)), rtol=1e-11
     )  # the trajectories are one
     run = model.run(drive)
-    along = signals(model, drive, model.vector(None), run.x)
+    along = {**table.columns, **signals(model, drive, model.vector(None), run.x)}
     metric = SimpleNamespace(drives=[drive], runs=[run], signals=[along])
     at, out = Trajectory(metric, structure, 0), {}
     for c in candidates(structure, catalogue()):
@@ -257,3 +261,39 @@ def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     notes = Rig(plant, [drive], [columns]).guesses()
     assert all(any(f"'{n}': it may be a {kind}; " in note for note in notes) for n, kind in units.items())
     assert not any("t_ms" in note for note in notes), "the time in another unit is no quantity of the rig"
+
+
+AXIS = """\
+format: thermoctl-plant/1
+title: Axis in its position loop
+inputs:
+  target: {unit: mm, role: setpoint, between_samples: hold}
+parameters:
+  kp: {value: 30, unit: 1/s, range: [5, 200]}
+nodes:
+  x: {unit: mm, storage: 1, initial: 0}
+flows:
+  follow: {into: x, rate: kp * (target - x), unit: mm/s}
+outputs:
+  position: {value: x, unit: mm, noise: 0.01}
+"""
+
+
+@pytest.mark.parametrize(
+    ("effect", "limited", "level"),
+    [
+        ("actuator_saturation", "min(max(40 * (target - x), -50), 50)", 50.0),
+        ("actuator_dead_zone", "max(40 * (target - x) - 8, 0) + min(40 * (target - x) + 8, 0)", 8.0),
+    ],
+)
+def test_what_is_made_of_a_set_point_is_limited_and_not_the_set_point(effect, limited, level):
+    """A screw axis that moves at 45 mm/s at most got a law of eleven parameters: its target was clipped."""
+    plant, t = loads(AXIS), np.arange(0, 12, 0.01)
+    follow = dataclasses.replace(plant.flows["follow"], rate=ex.parse(limited))
+    truth = compile_plant(dataclasses.replace(plant, flows={"follow": follow}))
+    target = np.random.default_rng(4).uniform(-10, 10, 24)[(t / 0.5).astype(int)]
+    table = truth.measure(Table("run", "", t, {"target": target}), 1)
+    (found,) = contract(diagnose(plant, [table], catalogue(), limits()))["findings"]
+    assert (found["effect"], found["where"]) == (effect, "follow")
+    (u,) = found["parameters"].values()
+    assert abs(u["value"] - level) < 0.03 * level and u["unit"] == "mm/s"

@@ -8,6 +8,7 @@ import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.hypothesis.effect import Effect
+from thermoctl.diagnosis.hypothesis.places import FAULTS
 from thermoctl.diagnosis.limits import Thresholds
 
 
@@ -30,4 +31,4 @@ def rare(effect: Effect, of_input: bool) -> int:
     """Return by how many factors `rare` an effect is less likely than constant physics.
 
     One if it depends on the time itself, and one more if it is a fault of a recorded input."""
-    return effect.timed + (of_input and effect.where != "drive")
+    return effect.timed + (of_input and effect.where in FAULTS)

@@ -190,6 +190,8 @@ class _Builder:
         rate = next((f.unit for f in flows if f.unit), None)
         units = {of: self._unit_of(self.symbols.get(of[-1])) for of in UNITS_OF}
         units |= {"unit_of_y": self._unit_of_y() or rate, "unit_of_rate": rate}
+        if self.place.flow and self.symbols.get("u") is self._changed_flow.rate:
+            units["unit_of_u"] = self._changed_flow.unit
         for key, unit in units.items():
             if key in text:
                 if unit is None:
@@ -330,8 +332,9 @@ class _Builder:
             self._new_flow(f"{f.name}_to_{b}", ex.mul(f.rate, share), None, b, f.unit)
 
     def _drive(self, form: str) -> None:
-        f, swap = self._changed_flow, {self.place.input or "": self.expression(form)}
-        self.flows[f.name] = dataclasses.replace(f, rate=ex.fill(f.rate, swap))
+        f, new = self._changed_flow, self.expression(form)
+        rate = new if self.symbols["u"] is f.rate else ex.fill(f.rate, {self.place.input or "": new})
+        self.flows[f.name] = dataclasses.replace(f, rate=rate)
 
     def _spill(self, what: Mapping[str, Any]) -> None:
         """Let what is above a level flow over: a share into the next node, if there is one, the rest out.

@@ -30,6 +30,7 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "joule_flow": ("T",),
     "motor": ("v",),
     "drive": ("u",),
+    "amplifier": ("u",),
     "sensor": ("y",),
     "body_sensor": ("y",),
     "passive_sensor": ("y",),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 from thermoctl.diagnosis.hypothesis.rig import Rig
@@ -122,6 +122,16 @@ def driven(rig: Rig) -> Iterator[Place]:
         if rig.is_motor(f) or rig.is_pump(f):
             for u in rig.drives_of(f):
                 yield Place(u if ex.calls_fmu(f.rate) else f.name, {"u": name(u)}, flow=f.name, input=u)
+
+
+def amplifiers(rig: Rig) -> Iterator[Place]:
+    """Yield what amplifiers put out: the inputs that drive a motor or a pump, and what is made of set points.
+
+    A controller makes the flow's whole rate of a set point, and its amplifier limits that."""
+    for p in driven(rig):
+        rate = rig.physics.flows[p.flow or ""].rate
+        made = rig.physics.inputs[p.input or ""].role == "setpoint" and not ex.calls_fmu(rate)
+        yield replace(p, symbols={"u": rate}) if made else p
 
 
 def askable(rig: Rig, place: Place) -> bool:
@@ -269,6 +279,7 @@ PLACES = {
     "joule_flow": _joule_flows,
     "motor": _motors,
     "drive": driven,
+    "amplifier": amplifiers,
     "sensor": _sensors,
     "body_sensor": lambda rig: (p for p in _sensors(rig) if p.where != rig.air),
     "passive_sensor": _passive,
