@@ -27,12 +27,16 @@ PUBLISHED = {
 }
 
 
-def law_of(folder: Path, rig: Rig) -> Diagnosis:
-    """Return the diagnosis without the catalogue."""
+def law_of(folder: Path, rig: Rig, without: Sequence[str] = ()) -> Diagnosis:
+    """Return the diagnosis without the catalogue, and without some columns of the recordings."""
     numbers, plant = limits(), load(folder / rig.folder / rig.plant)
 
     def read(names: str):
-        return read_recordings(plant, [folder / rig.folder / f"{n}.csv" for n in names.split()])
+        tables = read_recordings(plant, [folder / rig.folder / f"{n}.csv" for n in names.split()])
+        for t in tables:
+            for column in without:
+                del t.columns[column]
+        return tables
 
     return diagnose(plant, read(rig.runs), {}, numbers, read(rig.held_out))
 

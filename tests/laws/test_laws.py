@@ -417,8 +417,12 @@ outputs:
 """
 
 
-def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet():
-    """The flow had to have a role, though none says "flow"; differences were tried to the ambient only."""
+@pytest.mark.parametrize("read", [True, False], ids=["read", "unread"])
+def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet(read):
+    """The flow had to have a role, though none says "flow"; differences were tried to the ambient only.
+
+    A column that the plant file does not name was no signal of a law. A second thermometer is none: a law of
+    it would lead the plant to its own recording."""
     plant, t = loads(JACKET), np.arange(0, 6000, 8.0)
     cooled = Flow("cooled", ex.parse("3.1 * pumped * (iron - inlet)"), "iron", None)
     truth = compile_plant(replace(plant, flows={**plant.flows, "cooled": cooled}))
@@ -428,10 +432,18 @@ def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet():
         "inlet": 18 + 3 * np.sin(t / 900),
         "air": 23 - 2 * np.sin(t / 1300),
     }
-    known = case(plant, [truth.measure(Table("run", "", t, drives), 1)], {}, Budget(80))
+    if not read:
+        plant = replace(plant, inputs={i: q for i, q in plant.inputs.items() if i != "pumped"})
+    table = truth.measure(Table("run", "", t, drives), 1)
+    table.columns["second"] = table.columns["T"] + np.random.default_rng(2).normal(0, 0.5, len(t))
+    known = case(plant, [table], {}, Budget(80))
     null = fitted(known, plant, (), known.null)
-    best = propose_laws(known, null, limits())[0]
+    best, *others = propose_laws(known, null, limits())
+    read = {s.label for p in (best, *others) for x in p.terms for s in x.signals}
+    assert "second" not in read
     assert {s.label for term in best.terms for s in term.signals} == {"pumped", "iron - inlet"}
+    law = refitted_law(known, null, best, null)
+    assert "pumped" in law.plant.inputs and law.fit.rms()["T"] < 0.16
 
 
 @pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])
@@ -599,15 +611,20 @@ def test_no_law_is_claimed_where_nothing_is_missing():
 
 
 def test_a_law_that_recordings_set_aside_do_not_confirm_is_no_finding():
-    """The battery's reversible heat has its published form, and starts at another charge in the others."""
+    """The battery's reversible heat has its published form, and starts at another charge in the others.
+
+    Its voltage, which the plant does not read, tells the charge in all of them."""
     if not FOLDER.is_dir():
         pytest.skip(f"{FOLDER}: no such folder; set THERMOCTL_RECORDINGS to the folder of the recordings")
-    d = law_of(FOLDER, next(r for r in RIGS if r.name == "battery"))
+    rig = next(r for r in RIGS if r.name == "battery")
+    d = law_of(FOLDER, rig, ["voltage"])
     law = placed_law(d.searched.tried[0].fitted)
     assert {t.form.name: t.variables for t in law.proposal.terms} == {"total_product": {"current"}}
     assert d.law is None and d.refused == {("law", "cell")}
     (told,) = (a["expression"] for a in contract(d)["alternatives"] if a["effect"] == "law")
     assert "current" in told and re.search(r"\d", told)
+    voltage = law_of(FOLDER, rig).law
+    assert voltage and "voltage" in {s.label for t in voltage.proposal.terms for s in t.signals}
 
 
 @pytest.mark.slow  # twenty seconds

@@ -198,6 +198,9 @@ RULES: Mapping[str, Rule] = {
         {"law.signals._far": _nothing},
         searches=True,
     ),
+    "reading": Rule(
+        "a law depends on no unread column that follows a node", {"law.signals._follows": _no}, searches=True
+    ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "pays": Rule(
         "beside one effect that leaves only noise, laws compete only where a free function pays for one",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -24,7 +25,7 @@ from thermoctl.plant.fitting.refit import Fit, fit
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
-from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant
+from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant, filled
 from thermoctl.recording.table import Table
 
 LEAST = 40  # least number of measured values of at least one output
@@ -124,6 +125,21 @@ class Case:
         A part after a gap starts from its readings, also in a model with further states."""
         drives = [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
         return [dataclasses.replace(d, x0=_start(d, self.null.model, model)) for d in drives]
+
+    def drives_of(self, after: Plant, before: Plant, drives: Sequence[Excitation]) -> Sequence[Excitation]:
+        """Return the recordings as an extended plant reads them, from those of the plant before.
+
+        An effect or a law may read a further column."""
+        return drives if after.inputs.keys() == before.inputs.keys() else self.drives(compile_plant(after))
+
+    @cached_property
+    def columns(self) -> list[dict[str, np.ndarray]]:
+        """Return by recording each column (N,), whether the plant reads it or not, its gaps filled."""
+        some = [{c: v for c, v in t.columns.items() if np.isfinite(v).any()} for t in self.tables]
+        return [
+            {c: filled(t.t, v, False, c) for c, v in columns.items()}
+            for t, columns in zip(self.tables, some, strict=True)
+        ]
 
     def rig(self, plant: Plant, drives: Sequence[Excitation]) -> Rig:
         """Return the parts and signals of a plant, with these recordings."""

@@ -164,7 +164,7 @@ def _laws(
     groups = [(parent, refitted(parent, proposals))]
     if parent is not alone:
         more, plant = parent.score - alone.score, alone.fitted.plant
-        known = {*plant.nodes, *plant.inputs, *plant.parameters, "t"}
+        known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
         single = [p for p in proposals if len(p.terms) == 1]
         stands = [p for p in single if known >= {*p.place.nodes, *_names(p)}]
         groups.append((alone, refitted(alone, [replace(p, promise=p.promise + more) for p in stands])))

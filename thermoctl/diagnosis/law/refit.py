@@ -20,7 +20,7 @@ from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name
-from thermoctl.plant.simulation.simulate import SimulationError
+from thermoctl.plant.simulation.simulate import Excitation, SimulationError
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
 SIMPLER = 6  # number of further refits, of sums without their least significant term
@@ -55,11 +55,12 @@ def refitted_law(
     The refit ends early if it stays far from `leader`, the likeliest one so far. `more`: laws at other places
     that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
+    drives: Sequence[Excitation] = case.drives(parent.rough.model)
     for q in (p, *more):
-        rig = case.rig(plant, case.drives(parent.rough.model))
-        c = law_candidate(rig, q)
+        c = law_candidate(case.rig(plant, drives), q)
         values, ranges = _start(q)
-        plant = c.extend(values, ranges)
+        plant, before = c.extend(values, ranges), plant
+        drives = case.drives_of(plant, before, drives)
         own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
         effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:

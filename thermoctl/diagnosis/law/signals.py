@@ -14,6 +14,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.units import conversion, dimension
 
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
+FOLLOWS = 0.9  # share of a column's variance that a node shows, above which the column may be its reading
 DRAWS = 5  # number of values of all names for which two rates are compared
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
@@ -170,8 +171,19 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     for i in sorted(rig.moving_inputs - clocks):
         if i != rig.air and not i.endswith("_start"):
             out.append(_absolute(rig, place, i, p.inputs[i].unit))
+    out += [Signal(c, name(c), None, recorded=True) for c in rig.spare if not _follows(c, p, runs)]
     sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
     return [s for s in sized if s is not None]
+
+
+def _follows(column: str, p: Plant, runs: Sequence[Values]) -> bool:
+    """Return whether an unread column follows a node, so that it may be a reading of it.
+
+    A law of such a column would lead the plant to its own recording."""
+    values = [np.concatenate([np.atleast_1d(run[n]) for run in runs]) for n in (column, *p.nodes)]
+    with np.errstate(all="ignore"):
+        alike = np.corrcoef(values)[0, 1:] ** 2
+    return bool(np.any(alike > FOLLOWS))
 
 
 def _beside(rig: Rig, n: str) -> list[str]:

@@ -36,7 +36,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Excitation, SimulationError, compile_plant
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
@@ -328,14 +328,12 @@ def remade(
 
     Each place is looked up again: its expressions may have held an effect that is not there now."""
     case, placed = s.case, tuple[Placed, ...]()
-    drives = case.drives(case.null.model)
+    drives: Sequence[Excitation] = case.drives(case.null.model)
     try:
         for e in effects:
             c = found_again(candidates(case.rig(plant, drives), entries), e.key, e.label)
-            inputs = plant.inputs.keys()
-            plant = c.extend(e.values, e.ranges)
-            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
-                drives = case.drives(compile_plant(plant))
+            plant, before = c.extend(e.values, e.ranges), plant
+            drives = case.drives_of(plant, before, drives)
             placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
         return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
     except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):

@@ -174,9 +174,11 @@ class Metric:
 
     @cached_property
     def signals(self) -> list[dict[str, np.ndarray | float]]:
-        """Return by recording every name of the plant with its value or its values (N,) along the run."""
-        runs = zip(self.drives, self.fit.values, self.runs, strict=True)
-        return [signals(self.model, d, values, run.x) for d, values, run in runs]
+        """Return by recording every name with its value or its values (N,) along the run.
+
+        The names are those of the plant, and of columns that it does not read."""
+        runs = zip(self.plain.case.columns, self.drives, self.fit.values, self.runs, strict=True)
+        return [{**columns, **signals(self.model, d, values, run.x)} for columns, d, values, run in runs]
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return directions (rows, ...) without the part that the plant's own unknowns absorb."""

@@ -10,7 +10,6 @@ from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, Rig
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Node, Plant
-from thermoctl.plant.simulation.simulate import filled
 
 
 class Trajectory:
@@ -20,7 +19,6 @@ class Trajectory:
         d, run = metric.drives[r], metric.runs[r]
         self.recording, self.drive, self.run = r, d, run
         self.values: dict[str, np.ndarray | float] = {
-            **{c: filled(d.t, rig.columns[r][c], False, c) for c in rig.spare},
             **{i + STRAIGHT: u for i, u in zip(rig.plant.inputs, d.u.T, strict=False)},
             **metric.signals[r],
         }
