@@ -57,6 +57,26 @@ def test_a_whole_recording_is_one_part():
     assert in_parts(plant, table) == [table]
 
 
+def test_another_rate_is_no_gap_and_a_gap_beside_it_is_one():
+    """A heater's first 32 rows are 1 s apart, the others 0.2 s: it was 33 parts, of which 32 were left out."""
+    plant, slow = loads(WIDE_BLOCK, "plant.yaml"), np.arange(0.0, 32, 1.0)
+    t = np.concatenate([slow, 32 + np.arange(0.0, 1200, 0.2)])
+    columns = {"heat": (t > 500).astype(float), "air": np.full(len(t), 22.0), "T": 22 + 0.01 * t}
+    table = Table("run", "run.csv", t, columns)
+    assert in_parts(plant, table) == [table]
+    table.t[16:] += 9.0
+    assert [len(p) for p in in_parts(plant, table)] == [16, len(t) - 16]
+
+
+def test_a_part_has_the_values_of_its_recording():
+    """The value of run_1 did not apply to run_1_part2, and nothing said so."""
+    text = WIDE_BLOCK.replace("C: {value: 80,", "C: {value: 80, per_recording: true, values: {run: 70},")
+    model = compile_plant(loads(text, "plant.yaml"))
+    parts = in_parts(model.plant, run(missing=(400, 600)))
+    assert [p.name for p in parts] == ["run", "run_part2"]
+    assert [model.vector(None, p.name)[model.parameters.index("C")] for p in parts] == [70, 70]
+
+
 @pytest.mark.parametrize("rows", [1, 2, 3])
 def test_a_gap_after_the_first_rows(rows):
     parts = in_parts(loads(WIDE_BLOCK, "plant.yaml"), run(missing=(2 * rows, 60)))

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -88,6 +89,11 @@ class Parameter:
     per_recording: bool = False
     values: Mapping[str, float] = field(default_factory=dict)
     at: str = _place()
+
+    def value_in(self, recording: str) -> float:
+        """Return its value in a recording, or in a part of one after a gap (`run_1_part2`)."""
+        whole = re.sub(r"_part\d+$", "", recording)
+        return self.values.get(recording, self.values.get(whole, self.value))
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,16 @@ def gaps(t: np.ndarray) -> np.ndarray:
     """Return the rows (k,) after which samples are missing.
 
     That is beyond 4.5 steps of a regular recording. Of n random (exponential) intervals with median m, one is
-    longer than m log2(n / ALARM) with probability ALARM. Many such intervals are the logger's sampling."""
+    longer than m log2(n / ALARM) with probability ALARM. Many such intervals are the logger's sampling, and
+    so are several in a row, where it goes on at another rate."""
     steps = np.diff(t)
     if len(steps) < FEW:
         return np.zeros(0, int)
     median = float(np.median(steps))
     regular = np.mean(np.abs(steps - median) <= REGULAR * median) > 1 - 1 / MANY
     limit = MISSED * median if regular else median * log(len(steps) / ALARM) / log(2)
-    rows = np.flatnonzero(steps > limit)
+    around = ((k, np.median(steps[max(k - FEW, 0) : k + FEW + 1])) for k in np.flatnonzero(steps > limit))
+    rows = np.array([k for k, usual in around if steps[k] > MISSED * usual], int)
     return rows if len(rows) <= max(3, len(steps) // MANY) else np.zeros(0, int)
 
 

@@ -72,7 +72,7 @@ class Overlay:
 
         `values`: of the extension's parameters; the others have those of the extended plant."""
         base = self.base
-        here = {p.name: p.values.get(trajectory.drive.name, p.value) for p in self.own}
+        here = {p.name: p.value_in(trajectory.drive.name) for p in self.own}
         extra: dict[str, np.ndarray | float] = {**here, **values}
         for n, net in self.new:
             extra[n.name] = _new_node(n, net, extra, trajectory)

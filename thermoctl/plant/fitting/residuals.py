@@ -173,7 +173,7 @@ class Problem:
         for q, r in self.unknowns:
             if q in self.scales:
                 p = self.model.plant.parameters[q]
-                own = p.values.get(self.excitations[r].name, p.value) if r is not None else p.value
+                own = p.value_in(self.excitations[r].name) if r is not None else p.value
                 scale = self.scales[q]
                 out.append(scale.z(min(max(changes.get(q, own), scale.low), scale.high)))
             else:

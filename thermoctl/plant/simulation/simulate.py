@@ -172,10 +172,7 @@ class Model:
         if isinstance(parameters, np.ndarray):
             return np.ascontiguousarray(parameters, float)
         out = np.array(
-            [
-                p.values.get(recording, p.value) if recording else p.value
-                for p in self.plant.parameters.values()
-            ]
+            [p.value_in(recording) if recording else p.value for p in self.plant.parameters.values()]
         )
         for key, value in (parameters or {}).items():
             if key not in self.parameters:
