@@ -25,7 +25,7 @@ from thermoctl.diagnosis.report.figures import (
     with_interval,
 )
 from thermoctl.diagnosis.report.words import name, sentences, what_next, words
-from thermoctl.diagnosis.result import unfinished
+from thermoctl.diagnosis.result import CONTRADICTED, UNCONFIRMED, unfinished
 
 sizes = st.floats(-7, 5).map(lambda power: 10.0**power)
 chances = st.floats(0, 1)
@@ -50,7 +50,7 @@ def effects(draw, doubted=False):
         "parameters": {"k_x": {"value": value, "sd": sd, "unit": unit}},
     }
     if doubted and draw(st.booleans()):
-        entry["why_not"] = "nothing else confirms it"
+        entry["why_not"] = draw(st.sampled_from([UNCONFIRMED, CONTRADICTED]))
     return entry
 
 

@@ -8,7 +8,9 @@ import pytest
 
 from thermoctl.cli import main
 from thermoctl.diagnosis.report.explain import explain, why
-from thermoctl.diagnosis.report.words import sentences, words
+from thermoctl.diagnosis.report.words import sentences, what_next, words
+from thermoctl.diagnosis.result import CONTRADICTED
+from thermoctl.diagnosis.verdict import OVERRULED
 
 LAG = {
     "confirmed": 0.996,
@@ -202,3 +204,19 @@ def test_errors_that_may_be_the_sensors_own_are_not_told_as_something_missing():
     assert "2.3 times the noise" in words(plain) and "noisier than stated" in words(plain)
     assert "Something is missing" not in words(plain)
     assert "Something is missing" in words(plain | {"decision": numbers | {"remains": 0.99}})
+
+
+def test_what_recordings_set_aside_contradict_is_said_to_be_that():
+    """It was "rather likely, but no sure name", and the advice was to add it to the catalogue."""
+    lag = {
+        "effect": "sensor_lag",
+        "where": "voltage",
+        "when": None,
+        "probability": 0.9999,
+        "parameters": {},
+        "why_not": CONTRADICTED,
+    }
+    decision = {**FOUND["decision"], "row": OVERRULED, "worse": 0.999}
+    result = {**FOUND, "verdict": "unexplained", "findings": [], "alternatives": [lag], "decision": decision}
+    assert "though recordings set aside contradict it: sensor lag at voltage." in sentences(result)[0]
+    assert "set aside" in what_next(result) and "catalogue" not in what_next(result)

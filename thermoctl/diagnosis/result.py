@@ -24,6 +24,7 @@ from thermoctl.diagnosis.law.result import law_entry, wrong_ends
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.search.beam import Searched, Weighed
+from thermoctl.diagnosis.verdict import OVERRULED
 from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
@@ -38,6 +39,7 @@ FOLLOWS = 0.3
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
+CONTRADICTED = "recordings set aside contradict it"  # with it they are predicted worse
 UNTOLD = "one of its family is there, and these data do not tell which"
 # Number of blocks of a recording; least rms of a block with a large error, over that of the recording.
 BLOCKS, LARGE = 40, 1.5
@@ -97,6 +99,11 @@ class Diagnosis:
         return frozenset(self.asked) - {*self.decision.named}
 
     @property
+    def contradicted(self) -> Keys:
+        """Return the effects with which recordings set aside are predicted worse."""
+        return self.best.hypothesis.keys if self.decision.row == OVERRULED else frozenset()
+
+    @property
     def extends(self) -> bool:
         """Return whether the outcome has an effect or a law more than the original plant."""
         return bool(self.shown) or self.law is not None
@@ -145,7 +152,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "findings": [_finding(d, e) for e in d.shown],
             "alternatives": [
                 {"effect": e, "where": w, "probability": round(p, 4)}
-                | ({"why_not": UNCONFIRMED} if (e, w) in d.refused else {})
+                | ({"why_not": why} if (why := _doubt(d, {(e, w)})) else {})
                 | _expression(d, (e, w))
                 for (e, w), p in d.decision.alternatives
                 if (e, w) not in keys
@@ -422,13 +429,18 @@ def _why_not(d: Diagnosis, w: Weighed, keys: AbstractSet[Key]) -> str:
     """Return why a hypothesis with these effects is not the result."""
     if any(keys & {*f.members} for f in d.of_family.values()):
         return UNTOLD
-    if keys & d.refused:
-        return UNCONFIRMED
+    if doubt := _doubt(d, keys):
+        return doubt
     if w.score < _final_score(d):
         return "less likely than the result"
     if keys & standouts(d.physics.get(w.fitted.hypothesis.keys, {})):
         return "fits better, but not surely enough for a name"
     return "does not stand out of the misfit that it leaves"
+
+
+def _doubt(d: Diagnosis, keys: AbstractSet[Key]) -> str | None:
+    """Return what other data say against these effects, None where that is nothing."""
+    return UNCONFIRMED if keys & d.refused else CONTRADICTED if keys & d.contradicted else None
 
 
 def _final_score(d: Diagnosis) -> float:

@@ -288,7 +288,7 @@ class Rig:
         for c in self.spare:
             kinds = [MEANINGS[kind] for kind in SOUNDS if c in self.guessed(kind)]
             out.append(
-                f"the plant does not read the column '{c}': it may be a {' or a '.join(kinds or ['temperature'])}; "
+                f"the plant does not read the column '{c}': it is tried in laws and as a {' or a '.join(kinds or ['temperature'])}; "
                 "an input with a `role` states what it is"
             )
         return out

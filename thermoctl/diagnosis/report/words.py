@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 
 from thermoctl.diagnosis.report.figures import Output, Result, chance, outputs, size, with_interval
+from thermoctl.diagnosis.verdict import OVERRULED
 
 NEXT = {
     "consistent": "Nothing has to be done. Effects that these inputs do not excite would not show: record wider steps to exclude them.",
@@ -20,6 +21,10 @@ NEXT = {
 WORSE = (
     "Do not predict with the extended plant yet: it misses {} by more than the refitted plant does, on data that took no part. "
     "Record more, with wider steps, and diagnose again."
+)
+OTHERWISE = (
+    "Look for what is different in the recordings set aside, such as a wider range or another load. "
+    "Add one of them to those of the fit, and diagnose again."
 )
 PERHAPS = "Record more, with wider steps. They show whether it is missing."
 SMALL = "Errors of this size matter only where finer readings would, too. Longer recordings show more of their cause."
@@ -66,7 +71,9 @@ def what_next(result: Result) -> str:
             "`thermoctl diagnose --resolve` does both."
         )
     text = NEXT[result["verdict"]]
-    if result["verdict"] == "consistent" and _likely(result):
+    if result["decision"].get("row") == OVERRULED:
+        text = OTHERWISE
+    elif result["verdict"] == "consistent" and _likely(result):
         text = PERHAPS
     elif result["verdict"] in ("unexplained", "partly_explained") and _small(outputs(result)):
         text = f"Use the extended plant. {SMALL}" if result["findings"] else SMALL
@@ -157,8 +164,9 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
     if law:
         follows = f"; it follows {listed(law['of'])}" if law["of"] else ""
         return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
-    doubted = listed([name(a) for a in result["alternatives"] if a.get("why_not")][:2])
-    fits = f" What would fit, though nothing else confirms it: {doubted}." if doubted else ""
+    why = next((a["why_not"] for a in result["alternatives"] if a.get("why_not")), "")
+    doubted = listed([name(a) for a in result["alternatives"] if why and a.get("why_not") == why][:2])
+    fits = f" What would fit, though {why}: {doubted}." if doubted else ""
     rather = [a for a in result["alternatives"] if a["probability"] >= RATHER]
     if rather and not doubted:
         told = listed([f"{name(a)} ({chance(a['probability'])})" for a in rather])

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.limits import Thresholds
+from thermoctl.diagnosis.verdict import OVERRULED
 
 
 @dataclass(frozen=True)
@@ -99,11 +100,7 @@ ROWS: tuple[tuple[str, Callable[[Facts, Thresholds], bool], str], ...] = (
         lambda f, q: f.known < q.name,
         "unexplained",
     ),
-    (
-        "the findings predict held-out data worse than a refit alone",
-        lambda f, q: f.worse >= q.name,
-        "unexplained",
-    ),
+    (OVERRULED, lambda f, q: f.worse >= q.name, "unexplained"),
     ("something is supported, but no effect for sure", lambda f, q: not f.named, "ambiguous"),
     (
         "findings are supported and the residual is the sensors' noise",
