@@ -415,6 +415,30 @@ def test_numbers_without_names_are_no_date_by_chance(tmp_path):
         read(tmp_path, rows(*(f"20010301,{20 + i % 3},{i % 2}.5" for i in range(40))))
 
 
+@pytest.mark.parametrize(
+    "name, scale",
+    [
+        ("millis", 1e-3),
+        ("seconds", 1),
+        ("uptime_s", 1),
+        ("Elapsed", 1),
+        ("Laufzeit", 1),
+        ("Elapsed [min]", 60),
+    ],
+)
+def test_a_count_beside_a_date_is_no_time_of_day(tmp_path, name, scale):
+    """0, 10 ... 50 beside a date were read as hhmm: 600 s from row to row."""
+    found = read(tmp_path, rows(f"date,{name},T", *(f"2026-03-01,{10 * i},2{i}" for i in range(6))))
+    np.testing.assert_allclose(found.t, 10 * scale * np.arange(6))
+    found = read(tmp_path, rows("date,HourMin,T", *(f"2026-03-01,10{10 * i:02d},2{i}" for i in range(6))))
+    np.testing.assert_allclose(found.t, 600 * np.arange(6))
+
+
+def test_a_frame_of_can_holds_no_day_and_no_time(tmp_path):
+    with pytest.raises(InputError, match="no other that is a time"):  # candump: 0x123 was the day of the year
+        read(tmp_path, rows(*(f"  can0  123   [4]  {10 + i} 00 00 12" for i in range(8))))
+
+
 def test_names_one_a_line_above_the_table(tmp_path):
     head = ["%DataLog%", "Software : NSP", "Downloaded : 20260301 10:00:00"]
     for name in ("Coolant", "Pressure", *(f"Channel of {i}" for i in range(150))):

@@ -20,6 +20,8 @@ _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 # large, in ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by
 # chance.
 EVENER, ENOUGH = 0.5, 20
+# Names of numbers that count from a start, as do those with a unit, and of digits such as hhmm.
+_COUNTS, _OF_DAY = re.compile(r"(?i)elapsed|run|lauf|uptime|since|seit"), re.compile(r"(?i)hour|hh|uhr")
 _ZONES = ("utc", "gmt", "lst", "mst", "mdt", "pst", "pdt", "cst", "cdt", "est", "edt")  # MIDC
 _FIELDS = {  # names of the parts of a date that have a column each
     "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
@@ -68,6 +70,7 @@ def joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[tuple[tuple[str, 
 def _of_first_columns(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
     """Return a clock of first columns without names, if they are parts of a date that runs evenly."""
     names = list(filter(NO_NAME.match, sheet.columns))
+    names = [n for k, n in enumerate(names) if n == f"column_{k + int(names[0][7:])}"]  # none behind a word
     for order in map(str.split, _ORDERS.split("|")):
         at = dict(zip(order, names, strict=False))
         if len(at) == len(order) and all(_within(sheet.columns[n], *_RANGES[key]) for key, n in at.items()):
@@ -121,9 +124,11 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
     if isinstance(hours, np.ndarray):
         digits = hours[np.isfinite(hours)] if hours.dtype.kind == "f" else np.zeros(0)
         plain = len(digits) == len(hours) > 0 and np.all(digits == np.round(digits)) and digits.min() >= 0
+        counts = _COUNTS.search(of_day) or unit_of_time(of_day, sheet.units.get(of_day)) not in (None, "h")
+        counts = counts and not _OF_DAY.search(of_day)
         hourly = of_day.strip().lower() in _FIELDS["hour"]
         unnamed = NO_NAME.match(of_day) and NO_NAME.match(date) and np.any(np.diff(read[date].t) == 0)
-        if not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):
+        if counts or not plain or digits.max() > 235_959 or not (named(of_day) > 0 or hourly or unnamed):
             return None
         long = digits.max() > 2359 or "hhmmss" in of_day.lower()
         if digits.max() <= 24 and "hhmm" not in of_day.lower():
