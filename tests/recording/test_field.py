@@ -467,6 +467,13 @@ def test_a_factor_stays_in_the_unit_which_no_plant_takes(tmp_path, text):
         conversion("0.1 degC", "degC")
 
 
+@pytest.mark.parametrize("unit, kept", [("BTU/h", "BTU/h"), ("[cnt]", "cnt"), ("on/off", None), ("-", None)])
+def test_an_unknown_unit_below_the_header_is_kept(tmp_path, unit, kept):
+    """It vanished, so that a plant took 341 BTU/h for 341 W; in the header's brackets it stayed."""
+    found = read(tmp_path, table("Time,P,T", f"s,{unit},degC", "0,341,20", "1,341,21", "2,341,22"))
+    assert (found.units.get("P"), found.units["T"]) == (kept, "degC")
+
+
 def test_milliseconds_of_an_epoch_in_a_column_t_are_no_seconds(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("t,T\n" + "".join(f"{1773480000000 + 100 * i},{20 + i}\n" for i in range(6)))

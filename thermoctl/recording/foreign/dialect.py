@@ -368,12 +368,20 @@ def _header(
     units = {n: u for n, (_, u) in zip(names, split, strict=True) if u and n.strip()}
     for number, row in below:
         if not _is_kinds(row):
-            stated = (spelled(_bare(c), n) for c, n in zip(_widened(row, width, data), names, strict=True))
-            units |= {n: u for n, u in zip(names, stated, strict=True) if u and (known(u) or has_factor(u))}
+            units |= _units_of(_widened(row, width, data), names)
             notes.append(f"line {number} read as units")
             take_below(lines_of[-1][1], row, facts)
     units |= aligned(facts, names, units)
     return tuple(names), units, tuple(cells), {line, *(n for n, _ in below)}
+
+
+def _units_of(cells: list[str], names: list[str]) -> dict[str, str]:
+    """Return the units of a line below the header. An unknown one stays, so that a plant refuses it.
+
+    Above the first column, of times or a counter, it is a word such as `Sequence`."""
+    stated = [(n, c, spelled(_bare(c), n)) for n, c in zip(names, cells, strict=True)]
+    unknown = {n for n, c, _ in stated if not is_number(c) and (n != names[0] or c != _bare(c))}
+    return {n: u for n, _, u in stated if u and (known(u) or has_factor(u) or n in unknown)}
 
 
 _COMMAS = "; if the numbers have decimal commas, separate the cells by semicolons"

@@ -28,6 +28,7 @@ _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*
 _LAST = re.compile(r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
+_NO_UNITS = {"", "-", "–", "--", "ts", "rn", "0/1", "1/0", *WORDS["pairs"].split()}  # ts and rn: TOA5
 _SPELLED = {word: unit for unit, words in SPELLINGS.items() for word in words.split(" | ")}
 
 
@@ -46,7 +47,7 @@ def spelled(unit: str | None, name: str = "") -> str | None:
     if _UNIT.match(unit):  # N.m and m/s2
         unit = re.sub(r"(?<=[^\W\d_])[.· ](?=[^\W\d_])", "*", unit)
         unit = re.sub(r"(?<=[^\W\d_])(?=-?\d)", "^", unit)
-    return unit if unit not in ("", "-", "–", "--") else None
+    return unit if unit.lower() not in _NO_UNITS else None
 
 
 def time_unit(unit: str) -> str | None:
