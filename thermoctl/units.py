@@ -79,7 +79,7 @@ SPELLINGS = {
     "Hz": "hertz",
     "m": "meter | metre | meters | metres",
     "s": "second | seconds | sec | secs | sekunde | sekunden | sek | secondes | seconde | segundos "
-    "| segundo | secondi | seconden | sekunder | 秒 | сек",
+    "| segundo | seg | secondi | seconden | sekunder | 秒 | сек",
     "ms": "millisecond | milliseconds | msec | msecs | millis | millisekunden | мс | millisecondes "
     "| milisegundos | 毫秒",
     "us": "microsecond | microseconds | usec | micros | µsec | mikrosekunden | µs",

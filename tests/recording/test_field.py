@@ -444,6 +444,9 @@ FACTORS = {
     "Zeit [1/100 s]": "counts in steps",
     "t (10^-3 s)": "no other that is a time for sure",
     "time [ticks]": "no unit of time that is known",
+    "time (samples)": "no unit of time that is known",
+    "Time (HH)": "no unit of time that is known",
+    "Zeit (Âµs)": "no unit of time that is known",
 }
 
 

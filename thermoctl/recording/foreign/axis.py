@@ -107,6 +107,7 @@ def _run(t: np.ndarray) -> tuple[int, str]:
     return STRICT + (EVEN if even else 0), "increases evenly" if even else "increases"
 
 
+_BRACKETED = re.compile(r"\(([^\W\d_]{1,4}|(?:tick|sample|frame|count|cycle|step|point)s?)\.?\)$")
 _MINUTES = re.compile(r"(?i)(?<![:\w])m+(?:in\w*)?:s")  # a header such as "Time (min:sec)"
 
 
@@ -126,14 +127,18 @@ def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Se
             t = np.full(len(cells), np.nan)
             t[there] = seconds.t
             return replace(seconds, t=t)
+        # `Time (HH)`: a short word or one that counts; a longer one, as `Time (elapsed)`, tells which time it is.
+        written = unit or next(iter(_BRACKETED.findall(name)), None)
         stated, header = unit_of_time(name, unit, is_time), f"{name} [{unit}]" if unit else name
         seconds = clock.from_numbers(cells, stated, named(name) > 0)
         if seconds.kind != "epoch" and has_factor(header) and (stated or named(name) > 0):
             raise ClockError(
                 0, f"'{header}' counts in steps; write it in s, or say --time 0.1s for even rows"
             )
-        if seconds.kind == "bare" and unit and not is_time and named(name) > 0 and not known(unit):
-            raise ClockError(0, f"'{unit}' is no unit of time that is known; if it is s, say --time '{name}'")
+        if seconds.kind == "bare" and written and not is_time and named(name) > 0 and not known(written):
+            raise ClockError(
+                0, f"'{written}' is no unit of time that is known; if it is s, say --time '{name}'"
+            )
         return seconds
     if pc.all(pc.match_substring_regex(cells, r"^\s*\d{15,20}\s*$")).as_py():
         return _exact(cells)
