@@ -362,6 +362,18 @@ def test_decimal_commas_between_commas_are_refused(tmp_path):
     assert found.columns["P"].tolist() == [950, 1000, 1050]
 
 
+@pytest.mark.parametrize("sep", [";", "\t"])
+def test_thousands_that_begin_below_the_first_lines(tmp_path, sep):
+    """999 was followed by 1.0 where 1.000 stood below line 400, without a word."""
+    rpm = 503 + np.arange(600)
+    found = read(
+        tmp_path,
+        table(f"Zeit{sep}n", *(f"{i}{sep}{n:,}".replace(",", ".") for i, n in enumerate(rpm.tolist()))),
+    )
+    np.testing.assert_array_equal(found.columns["n"], rpm)
+    assert any("1.000 read as 1000" in n for n in found.notes)
+
+
 def test_two_runs_in_one_file(tmp_path):
     text = table("time,T", "0,20", "1,21", "time,T", "0,30", "1,31", "2,32")
     with pytest.raises(

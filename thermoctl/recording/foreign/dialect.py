@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 from thermoctl.files.yamlfile import InputError
@@ -46,6 +47,7 @@ _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _STATED = re.compile(r"[A-Za-z][^,;\t|:=]{0,60}?\s[:=]\s+\S")  # `Channel : RPM` above a table
 _DECIMALS = re.compile(r"[-+]?\d*[.,]\d+$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
+_THOUSANDS = re.compile(rb"\.(?<!:\d\d\.)\d{3}(?=[;\t\r\n])")  # of 1.050 in a cell, no seconds
 _KINDS = {"", *WORDS["kinds"].split()}
 
 
@@ -177,8 +179,10 @@ def _kind(cell: str) -> str:
     return "n" if is_number(cell) else "t" if is_time(cell) else "w"
 
 
-def find_dialect(path: Path, text: str) -> Dialect:
-    """Find the dialect from the first lines of a file. Raises InputError (file:line) where there is none."""
+def find_dialect(path: Path, text: str, whole: bytes = b"") -> Dialect:
+    """Find the dialect from the first lines of a file. Raises InputError (file:line) where there is none.
+
+    `whole`: the file, whose later lines tell whether a point parts thousands if the first ones do not."""
     sample, comments, stated = _sample(path, text)
     separator, rows = _separator(path, sample, (stated,) if stated else SEPARATORS)
     width = Counter(len(c) for _, c in _tail(rows)).most_common(1)[0][0]
@@ -195,8 +199,13 @@ def find_dialect(path: Path, text: str) -> Dialect:
     if skipped := sum(1 for n, _ in head if n not in used):
         notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
     facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
-    decimal = _decimal(data, separator)
-    if decimal == "." and separator == ";" and (parted := _perhaps_thousands(data)):
+    shown_by = data
+    if separator in ";\t" and not any(re.search("[.,]", c) and not is_time(c) for row in data for c in row):
+        found = (m.span() for m in islice(_THOUSANDS.finditer(whole), SAMPLE))
+        later = [whole[whole.rfind(b"\n", 0, a) + 1 : whole.find(b"\n", b)].decode() for a, b in found]
+        shown_by = data + [c for line in later if len(c := cells_of(line, separator)) == width]
+    decimal = _decimal(shown_by, separator)
+    if decimal == "." and separator in ";\t" and (parted := _perhaps_thousands(shown_by)):
         notes.append(f"{parted} read with a decimal point (if it parts thousands: --decimal ,)")
     if separator != "," and width > 1:
         notes.append(f"separator {shown(separator)}" + (", decimal comma" if decimal == "," else ""))
@@ -544,8 +553,9 @@ def _decimal(data: list[list[str]], separator: str) -> str | None:
     cells = [x for c in data for x in c if re.search(r"\d", x)]
     commas = [x for x in cells if _COMMA.match(x)]
     if not commas:
-        thousands = separator == ";" and any(map(_parts_thousands, zip(*data, strict=True)))
-        return None if thousands or any("," in x and not is_time(x) for x in cells) else "."
+        if separator in ";\t" and any(map(_parts_thousands, zip(*data, strict=True))):
+            return ","
+        return None if any("," in x and not is_time(x) for x in cells) else "."
     if any(re.match(r"[-+]?\d*\.\d", x) for x in cells):
         return None
     return "," if separator == ";" or any(not _AMBIGUOUS.match(x) for x in commas) else None

@@ -172,7 +172,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     text, depth = _innermost(text)
     if depth:
         notes.append(f"the rows of the innermost of {depth + 1} nested tables read")
-    dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"))
+    dialect = find_dialect(path, text[: 4 * HEAD].decode("utf-8", errors="ignore"), text)
     if len(dialect.names) == 1:
         text = _with_empty_lines(text, dialect, notes)
     text = _without_cut(text, dialect, notes)
