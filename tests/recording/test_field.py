@@ -124,6 +124,23 @@ def test_matlab_matrix_stands_beside_vectors_of_its_length(tmp_path):
         np.testing.assert_allclose([found.columns["x_1"], found.columns["x_2"]], x)
 
 
+def test_matlab_structs_keep_their_matrices_and_what_is_left_out_is_said(tmp_path):
+    """A matrix of a struct, a complex or a longer vector vanished; Simulink's structure with time was refused."""
+    savemat = pytest.importorskip("scipy.io").savemat
+    t, rising = np.arange(6.0), 20 + np.arange(6.0)
+    signals = np.zeros(2, dtype=[("values", "O"), ("label", "O")])
+    signals[0], signals[1] = (np.column_stack([rising, t]), "T"), (rising[:, None], "")
+    savemat(tmp_path / "run.mat", {"simout": {"time": t[:, None], "signals": signals}})
+    found = read_recording(tmp_path / "run.mat")
+    assert [found.columns[n][1] for n in ("T_1", "T_2", "signal_2")] == [21, 1, 21]
+    log = {"t": t, "T": rising, "xy": np.column_stack([rising, t]), "n": np.arange(9.0)}
+    savemat(tmp_path / "log.mat", {"log": log, "Z": rising * 1j, "cube": np.zeros((6, 2, 2))})
+    found = read_recording(tmp_path / "log.mat")
+    assert found.columns.keys() == {"T", "xy_1", "xy_2"}
+    left = {n.partition("'")[2].partition("'")[0] for n in found.notes if "left out" in n}
+    assert left == {"n", "Z", "cube"}
+
+
 def test_an_assumed_unit_is_said(tmp_path):
     assert any("assumed: s" in n for n in read(tmp_path, table("time,T", "0,20", "1,21")).notes)
     assert any("a counter" in n for n in read(tmp_path, CLOCKS["a counter, for want of times"][0]).notes)

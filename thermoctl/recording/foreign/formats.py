@@ -12,6 +12,7 @@ import json
 import re
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
@@ -233,34 +234,43 @@ def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[
             if value.index.dtype.kind in "mM":
                 columns = {str(value.index.name or "Time"): np.asarray(value.index), **columns}
             sheets.append(Sheet(columns, place_in(path), name=name))
-        elif len(columns := _vectors(value)) > 1:
-            sheets.append(Sheet(columns, place_in(path), name=name, step_s=_stated(_fields(value))))
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-            loose[name] = np.squeeze(value).astype(float)
-    sheets += _of_arrays(path, loose)
+        elif vectors := _vectors(value):
+            step, found = _stated(_fields(value)), _of_arrays(path, vectors, notes)
+            sheets += [replace(s, name=f"{name}: {s.name}", step_s=step) for s in found]
+        elif _is_array(value):
+            loose[name] = np.squeeze(value)
+    sheets += _of_arrays(path, loose, notes)
     for sheet in sheets:
         sheet.step_s = sheet.step_s or step_s
     if len(sheets) > 1:
         sheets.sort(key=len, reverse=True)
-        notes.append(f"'{sheets[0].name}' read, of {', '.join(content)} (another: --sheet VARIABLE)")
+        notes.append(
+            f"'{sheets[0].name}' read, of {'; '.join(s.name for s in sheets)} (another: --sheet VARIABLE)"
+        )
     return sheets[:1]
 
 
-def _of_arrays(path: Path, loose: dict[str, np.ndarray]) -> list[Sheet]:
-    """Return vectors and matrices of one length as tables; a matrix has its longer side as rows."""
-    sheets = []
+def _of_arrays(path: Path, loose: Mapping[str, np.ndarray], notes: list[str]) -> list[Sheet]:
+    """Return vectors and matrices of one length as tables; a matrix has its longer side as rows.
+
+    Those that are in no table are a note."""
+    sheets, lost = [], set(loose)
     for size in {max(v.shape) for v in loose.values()}:
-        own = {n: v for n, v in loose.items() if max(v.shape) == size and v.ndim <= 2}
+        own = {n: v for n, v in loose.items() if max(v.shape) == size and v.ndim <= 2 and v.dtype.kind != "c"}
         columns: dict[str, Cells] = {}
         for name, v in own.items():
             if v.ndim == 1:
-                columns[name] = v
+                columns[name] = v.astype(float)
                 continue
-            tall = v.T if v.shape[0] < size else v
+            tall = (v.T if v.shape[0] < size else v).astype(float)
             of = name if len(own) > 1 else "column"
             columns |= {f"{of}_{i + 1}": c for i, c in enumerate(tall.T)}
         if len(columns) > 1:
             sheets.append(Sheet(columns, place_in(path), name=", ".join(own)))
+            lost = lost - own.keys()
+    notes += [
+        f"'{n}' left out: {loose[n].dtype}, size {' x '.join(map(str, loose[n].shape))}" for n in sorted(lost)
+    ]
     return sheets
 
 
@@ -287,27 +297,28 @@ def _fields(value: Any) -> dict[str, Any]:
     return {n: record[n] for n in value.dtype.names}
 
 
-def _vectors(value: Any) -> dict[str, Cells]:
-    """Return the vectors of a struct, also of dSPACE's X.Data and Y(k).Name, Y(k).Data."""
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiubc" and value.size > 1
+
+
+def _vectors(value: Any) -> dict[str, np.ndarray]:
+    """Return the vectors and matrices of a struct, by name.
+
+    Also those of dSPACE's X.Data and Y(k).Name, Y(k).Data, and of Simulink's signals(k).values."""
     fields = _fields(value)
-    if (
-        "X" in fields
-        and "Y" in fields
-        and "Data" in (fields["X"].dtype.names or ())
-        and fields["Y"].dtype.names
-    ):
-        vectors = {"time": np.ravel(fields["X"].reshape(-1)[0]["Data"]).astype(float)}
+    inner = {
+        k: fields[k].dtype.names or () for k in ("X", "Y", "signals") if isinstance(fields.get(k), np.ndarray)
+    }
+    vectors = {n: np.squeeze(v) for n, v in fields.items() if _is_array(v)}
+    if "Data" in inner.get("X", ()) and "Data" in inner.get("Y", ()):
+        vectors = {"time": np.ravel(fields["X"].reshape(-1)[0]["Data"])}
         for y in fields["Y"].reshape(-1):
             name = str(np.ravel(y["Name"])[0]).strip('"').rpartition("/")[2]
-            vectors[name] = np.ravel(y["Data"]).astype(float)
-    else:
-        vectors = {
-            n: np.ravel(v).astype(float)
-            for n, v in fields.items()
-            if isinstance(v, np.ndarray) and v.dtype.kind in "fiub" and v.size > 1 and v.size == max(v.shape)
-        }
-    rows = len(next(iter(vectors.values()), ()))
-    return dict(vectors) if all(len(v) == rows for v in vectors.values()) else {}
+            vectors[name] = np.ravel(y["Data"])
+    signals = fields["signals"].reshape(-1) if {"values", "label"} <= set(inner.get("signals", ())) else ()
+    for k, signal in enumerate(signals, 1):
+        vectors["".join(np.ravel(signal["label"])) or f"signal_{k}"] = np.squeeze(signal["values"])
+    return vectors
 
 
 def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
