@@ -613,11 +613,24 @@ def test_channels_in_turn_without_a_sign_are_named(tmp_path):
         ),
         ('[{"t": 0, "a": [1, 2]}, {"t": 2, "a": [3, 4]}, {"t": 3, "a": [5, 6]}]', ["a_1", "a_2"]),
         ('{"id": "x", "samples": [["t", "u"], [0, 1], [1, 4], [3, 5]]}', ["u"]),
+        ('{"columns": ["t", "u"], "index": [0, 1], "data": [[0, 1], [1, 4]]}', ["u"]),
+        ('{"columns": [["a", "u"], ["b", "u"]], "index": [0, 1], "data": [[0, 1], [1, 4]]}', ["a_u", "b_u"]),
+        (
+            '{"results": [{"statement_id": 0, "series": [{"columns": ["t", "u"], "values": [[0, 1], [1, 4]]}]}]}',
+            ["u"],
+        ),
     ],
 )
 def test_lists_in_json(tmp_path, content, names):
-    how = {} if '"t"' in content else {"time": "1s"}
+    how = {} if '"t"' in content or "index" in content else {"time": "1s"}
     assert list(read(tmp_path, content, "run.json", **how).columns) == names
+
+
+def test_signals_named_by_instance_or_topic(tmp_path):
+    """Two instances of Prometheus were 'equal times', which --equal-times mean would have mixed."""
+    for head in ("timestamp,instance,value", "time,topic,payload"):
+        found = read(tmp_path, rows(head, *(f"{i},a,2{i}\n{i},b,{i}" for i in range(6))))
+        assert {n: c[5] for n, c in found.columns.items()} == {"a": 25, "b": 5}
 
 
 @pytest.mark.parametrize(

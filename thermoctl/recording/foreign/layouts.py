@@ -152,6 +152,12 @@ def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
     if content and all(isinstance(x, dict) for x in content):
         if series := [s for x in content for s in _series(path, x) or ()]:
             return series
+        if not any(named(k) > 0 for x in content for k in x):  # InfluxDB: results, each with its series
+            inner = [
+                f for x in content for v in x.values() if isinstance(v, list) and (f := _of_json(path, v))
+            ]
+            if inner:
+                return [s for f in inner for s in f]
         tables = [s for x in content if (s := _lists(path, x))]
         if len(tables) == 1 == len(content):
             return tables
@@ -185,11 +191,16 @@ def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
 
 
 def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
-    """Read a series of InfluxDB 1 (columns, values) or of Prometheus (metric, values)."""
-    if not isinstance(values := content.get("values"), list):
+    """Read columns and values of InfluxDB 1, columns and data of pandas, metric and values of Prometheus."""
+    values = content.get("values", content.get("data"))
+    if not isinstance(values, list) or not all(isinstance(v, list) for v in values):
         return None
-    if isinstance(content.get("columns"), list):
-        return [_records(path, [dict(zip(content["columns"], v, strict=False)) for v in values])]
+    if isinstance(names := content.get("columns"), list):
+        names = ["_".join(map(str, n)) if isinstance(n, list) else str(n) for n in names]
+        index = content.get("index")
+        if isinstance(index, list) and len(index) == len(values) and not any(named(n) > 0 for n in names):
+            names, values = ["index", *names], [[i, *v] for i, v in zip(index, values, strict=True)]
+        return [_records(path, [dict(zip(names, v, strict=False)) for v in values])]
     if isinstance(content.get("metric"), dict):
         labels = content["metric"]
         name = "_".join(str(v) for k, v in labels.items() if k not in ("job",)) or "value"
