@@ -533,6 +533,15 @@ def test_a_table_of_other_rows_above(tmp_path):
     assert found.units == {"T1": "degC"} and found.t[-1] == 5
 
 
+def test_rows_above_a_wider_table_are_said(tmp_path):
+    """A logger restarted with a further column: half of the rows went as 'lines before the header'."""
+    narrow, wide = (f"{i},2{i}" for i in range(3)), (f"{i},2{i},1" for i in range(3, 9))
+    found = read(tmp_path, rows("time,T", *narrow, "time,T,P", *wide))
+    assert any(
+        "4 lines before the header left out, 3 of them rows of another table" in n for n in found.notes
+    )
+
+
 def test_a_unit_directly_behind_a_name(tmp_path):
     text = rows(
         "No.,Time,Temperature°C,Humidity%RH", *(f"{i},2026-03-01 10:0{i}:00,2{i},4{i}" for i in range(5))

@@ -196,8 +196,10 @@ def find_dialect(path: Path, text: str, whole: bytes = b"") -> Dialect:
     first = rows[begin][0] if begin < len(rows) else rows[-1][0] + 1
     notes = [f"line {longer}: its cells beyond column {width} left out"] if longer else []
     names, units, header, used = _header(path, head, comments, separator, width, data, facts, notes)
-    if skipped := sum(1 for n, _ in head if n not in used):
-        notes.append(f"{skipped} line{'s' if skipped > 1 else ''} before the header left out")
+    if skipped := [c for n, c in head if n not in used]:
+        of_numbers = sum(bool(c[1:]) and all(is_number(x) or is_time(x) for x in c) for c in skipped)
+        lost = f", {of_numbers} of them rows of another table" if of_numbers > 1 else ""
+        notes.append(f"{len(skipped)} line{'s' if skipped[1:] else ''} before the header left out{lost}")
     facts |= {m[1].strip().lower(): [m[2]] for c in header if (m := FACT.match(c))}
     shown_by = data
     if separator in ";\t" and not any(re.search("[.,]", c) and not is_time(c) for row in data for c in row):
