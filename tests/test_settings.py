@@ -78,7 +78,7 @@ def test_a_rig_can_be_stopped_while_its_file_has_a_mistake(tmp_path, capsys, fil
     assert [p.axis for p in found.parts] == [p.axis for p in rig.parts]
     assert cli.main(["stop", "--config", str(broken)]) == 0
     said = capsys.readouterr()
-    assert "not running" in said.out and "stop needs this file's socket only" in said.err
+    assert "not running" in said.out and "stop needs the rig's socket only" in said.err
     assert cli.main(["arm", "--config", str(broken)]) == 2
 
 

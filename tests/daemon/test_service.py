@@ -65,6 +65,24 @@ def test_a_daemon_of_run_is_found_restarted_and_stopped(daemon, unrecorded, caps
     assert main(["stop", *flag]) == 0 and capsys.readouterr().out == "not running\n"
 
 
+@pytest.mark.parametrize("harm", ["cut off", "gone", "another socket"])
+def test_an_armed_rig_whose_file_names_its_socket_no_more(daemon, unrecorded, capsys, harm):
+    """`disarm` and `stop` said 'not running', and `restart` began a second daemon beside the armed one."""
+    text, flag = unrecorded.read_text(), ["--config", str(unrecorded)]
+    assert daemon.ask("arm")["ok"]
+    if harm == "gone":
+        unrecorded.unlink()
+    else:
+        cut = text[: text.index("protection:")] + "prot"
+        unrecorded.write_text(cut if harm == "cut off" else text.replace("simulated.sock", "other.sock"))
+        assert main(["run", *flag]) == 2 and "not running" not in capsys.readouterr().err
+    assert main(["disarm", *flag]) == 0
+    assert daemon.ask("status")["state"] == "READY"
+    assert main(["stop", *flag]) == 0 and daemon.process.wait(30) == 0
+    assert capsys.readouterr().out.endswith(f"stopped (pid {daemon.process.pid})\n")
+    unrecorded.write_text(text)
+
+
 def test_stop_leaves_the_rig_of_another_configuration_alone(daemon, unrecorded, tmp_path, capsys):
     assert daemon.ask("arm")["ok"]
     assert main(["stop", "--config", str(another(unrecorded, tmp_path))]) == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from pathlib import Path
 from typing import Any
 
 from thermoctl.advice import command_table as advice
@@ -42,6 +43,7 @@ def call(command: Command, args: argparse.Namespace) -> int:
     takes = command.takes.split()
     if "settings" in takes:
         from thermoctl.configuration.settings import for_stopping, load_rig, load_settings
+        from thermoctl.daemon.lock import started
 
         each = command.name in EACH_AXIS and "#" not in args.config
         whole = each or command.name in WHOLE_RIG and "#" not in args.config
@@ -50,11 +52,12 @@ def call(command: Command, args: argparse.Namespace) -> int:
         except InputError as e:
             if command.name not in SAFE:
                 raise
-            try:
-                args.settings = for_stopping(args.config)
-            except OSError:  # no such file
-                raise e from None
-            print(f"thermoctl: {e}; {command.name} needs this file's socket only", file=sys.stderr)
+            args.settings = for_stopping(args.config)
+            if started(args.settings) is args.settings and not Path(args.settings.path).exists():
+                raise
+            print(f"thermoctl: {e}; {command.name} needs the rig's socket only", file=sys.stderr)
+        if command.name in SAFE:
+            args.settings = started(args.settings)
         if each and args.settings.axes:
             return _each_axis(function, takes, args)
     return (function(*(getattr(args, t) for t in takes)) if takes else function(args)) or 0

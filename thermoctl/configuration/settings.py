@@ -14,7 +14,7 @@ import dataclasses
 import re
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -433,16 +433,19 @@ hal: {backend: simulated, plant: none}
 """
 
 
-def for_stopping(path: str) -> Settings:
-    """Return settings that hold the sockets of a file, which may have mistakes elsewhere.
+def for_stopping(path: str, socket: str = "", axes: Sequence[str] = ()) -> Settings:
+    """Return settings that hold the sockets of a file, which may have mistakes elsewhere, or be gone.
 
-    They serve to disarm and stop a running daemon, and nothing else. Raises InputError, OSError."""
-    file, _, axis = path.rpartition("#") if not Path(path).exists() else (path, "", "")
-    text = Path(file).read_text(errors="replace")
+    `socket`, `axes`: those of the running daemon, if they are known. The settings serve to disarm and stop it,
+    and nothing else. Raises InputError."""
+    file, _, axis = path.rpartition("#") if "#" in path and not Path(path).exists() else (path, "", "")
+    text = Path(file).read_text(errors="replace") if Path(file).is_file() else ""
     section = {m[1]: m[0] for m in re.finditer(r"(?ms)^(socket|axes):.*?(?=^[^\s#]|\Z)", text)}
     rig = _settings(loads(_ANYTHING + section.get("socket", ""), file), file, DEFAULT)
     indent = re.search(r"\n( +)[a-z]", section.get("axes", ""))
     names = re.findall(rf"(?m)^{indent[1]}({_AXIS.pattern}):", section["axes"]) if indent else []
+    if socket:
+        rig, names = dataclasses.replace(rig, socket=dataclasses.replace(rig.socket, path=socket)), list(axes)
     rig = dataclasses.replace(rig, axes=tuple(_named(rig, name, len(names)) for name in names))
     return rig.of_axis(axis) if axis else rig
 

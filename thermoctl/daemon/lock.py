@@ -1,6 +1,7 @@
 """The lock of a rig, beside its socket: held by the daemon, or by a command that drives the rig itself.
 
-The lock ends with its last holder, for whatever reason; the file holds the holder's process id.
+The lock ends with its last holder, for whatever reason. The file holds the holder's process id, the path of
+its configuration, its socket and its axes, a line each.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import os
 import time
 from pathlib import Path
 
-from thermoctl.configuration.settings import Settings
+from thermoctl.configuration.settings import Settings, for_stopping
 from thermoctl.files.safe_file import long_socket
 from thermoctl.files.yamlfile import InputError
 
@@ -37,6 +38,10 @@ def hold(settings: Settings) -> int:
     path = lock_path(settings)
     if long := socket_too_long(settings):
         raise InputError(long)
+    if (other := started(settings)) is not settings:
+        raise InputError(
+            f"{settings.path}: its daemon runs on {other.socket.path}; stop it with `thermoctl stop`"
+        )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -53,7 +58,9 @@ def hold(settings: Settings) -> int:
             )
         time.sleep(0.01)
     os.ftruncate(file, 0)
-    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    axes = [part.axis for part in settings.axes]
+    own = (os.getpid(), os.path.abspath(settings.path), settings.socket.path, *axes)
+    os.pwrite(file, os.fsencode("\n".join(map(str, own))), 0)
     return file
 
 
@@ -70,11 +77,32 @@ def is_retaken(settings: Settings, file: int) -> bool:
     return True
 
 
+def started(settings: Settings) -> Settings:
+    """Return settings to stop the daemon of this file, where it runs on other sockets than the settings have.
+
+    The file may have been edited, cut off or deleted since. Else the settings themselves are returned."""
+    file = os.path.abspath(settings.path)
+    above = Path(file).parents
+    folders = {lock_path(settings).parent, above[0], *(p / "run" for p in above), Path("/run/thermoctl")}
+    for path in (path for folder in folders for path in folder.glob("*.lock")):
+        with contextlib.suppress(OSError):  # deleted meanwhile, or another user's
+            lines = os.fsdecode(path.read_bytes()).splitlines()
+            if lines[1:2] == [file] and _holder(path) is not None:
+                named = f"{settings.path}#{settings.axis}" if settings.axis else settings.path
+                other = for_stopping(named, lines[2], lines[3:])
+                if [p.socket.path for p in other.parts] != [p.socket.path for p in settings.parts]:
+                    return other
+    return settings
+
+
 def holder(settings: Settings) -> int | None:
     """Return the process id that holds the rig, or None.
 
     Raises InputError when this user may not read the lock."""
-    path = lock_path(settings)
+    return _holder(lock_path(settings))
+
+
+def _holder(path: Path) -> int | None:
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
@@ -100,5 +128,5 @@ def _locked(file: int, kind: int) -> bool:
 
 
 def _written(file: int) -> int:
-    text = os.pread(file, 32, 0).strip()
+    text = os.pread(file, 32, 0).partition(b"\n")[0]
     return int(text) if text.isdigit() else 0

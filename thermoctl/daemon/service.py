@@ -19,7 +19,7 @@ from pathlib import Path
 
 from thermoctl.configuration.settings import Settings, load_rig
 from thermoctl.daemon.control_socket import ask, settled
-from thermoctl.daemon.lock import holder
+from thermoctl.daemon.lock import holder, started
 from thermoctl.daemon.tick.loop import die_with_parent
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.shipped import shipped
@@ -159,7 +159,7 @@ def stop(settings: Settings) -> int:
 
 def restart(settings: Settings) -> int:
     """Stop, then start."""
-    return stop(settings) or start(settings)
+    return stop(started(settings)) or start(settings)
 
 
 def log_path(settings: Settings) -> Path:
