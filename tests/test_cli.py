@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -34,6 +35,17 @@ def test_the_help_lists_every_command_once_below_its_purpose(capsys):
 def test_the_package_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "thermoctl", "--version"], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("thermoctl ")
+
+
+@pytest.mark.parametrize("run", ["exec {} >&-", "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 exec {}"])
+def test_without_stdout_or_in_a_locale_that_is_not_utf_8(tmp_path, run):
+    """Both were a traceback: `None` has no `flush`, and the reader's words are no ASCII."""
+    (tmp_path / "log.csv").write_text("Zeit [s];T [°C]\n0;20,5\n1;21,5\n")
+    line = run.format(f"{sys.executable} -m thermoctl recordings import --explain log.csv")
+    env = os.environ | {"PYTHONPATH": f"{Path(__file__).parents[1]}:{Path(__file__).parents[1] / 'hal'}"}
+    done = subprocess.run(line, shell=True, cwd=tmp_path, env=env, capture_output=True)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode()
+    assert b"degC" in done.stdout or ">&-" in run
 
 
 @pytest.mark.parametrize(

@@ -129,14 +129,23 @@ def _spare_inputs(args: argparse.Namespace) -> None:
                 raise InputError(f"{target}: is a file that the command reads; name another one to write")
 
 
+def _words() -> list[str]:
+    """Return the words of the command line; in a locale that is not UTF-8 start again in UTF-8 mode.
+
+    Our files are UTF-8 in every locale."""
+    if sys.getfilesystemencoding() != "utf-8":
+        os.execv(sys.executable, [sys.executable, "-P", "-X", "utf8", "-m", "thermoctl", *sys.argv[1:]])
+    return sys.argv[1:]
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status."""
-    args = _parsed(parser(), sys.argv[1:] if argv is None else argv)
+    args = _parsed(parser(), _words() if argv is None else argv)
     try:
         which_rig.choose(args)
         _spare_inputs(args)
         code = call(args.row, args)
-        sys.stdout.flush()  # a full disk behind `> FILE` shows here
+        print(end="", flush=True)  # a full disk behind `> FILE` shows here
         return code
     except InputError as e:
         print(f"thermoctl: {e}", file=sys.stderr)
@@ -146,7 +155,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as e:
         print(f"thermoctl: {e.filename or args.row.name}: {e.strerror or e}", file=sys.stderr)
         if e.filename is None:  # stdout: the rest of its buffer must not fail once more at the end
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 3
     except KeyboardInterrupt:
         return 130
