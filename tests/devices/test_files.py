@@ -240,7 +240,7 @@ def test_a_page_without_signals_below_costs_no_signal_beside_it(tmp_path):
 
 
 J1939 = 'BO_ 2566844158 ET1: 8 DEV\n SG_ T : 0|8@1+ (1,-40) [0|0] "deg C" HOST\n'
-ET1 = "t: {message: ET1, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1, sentinels: [215]"
+ET1 = "t: {message: ET1, signal: T, unit: degC, rate_hz: 20, stale_after_s: 1"
 
 
 def test_a_j1939_message_comes_from_any_source_at_any_priority(tmp_path):
@@ -252,6 +252,18 @@ def test_a_j1939_message_comes_from_any_source_at_any_priority(tmp_path):
     for other in (0x18FEEF00, 0x18FEED00, 0x19FEEE00):
         assert read(dev, (EXTENDED | other, b"\x5a" + bytes(7))).status[ROLE["air_c"]] != OK
     assert "none is PGN 65262 of J1939" in dev.silence()
+
+
+@pytest.mark.parametrize("bits, good", [(8, 0xFA), (16, 0xFAFF), (32, 0xFAFFFFFF), (12, 0xFFF)])
+def test_what_j1939_calls_not_available_or_an_error_is_no_reading(tmp_path, bits, good):
+    """0xFF of a thermometer that is not fitted was 215 degC; 12 bits have no such codes."""
+    signal = J1939.replace("0|8@1+ (1,-40)", f"0|{bits}@1+ (1e-8,0)")
+    dev = device(tmp_path, START + signal, [ET1], "{t: air_c}")
+    for raw in (good, 0xFE << bits - 8, (1 << bits) - 1):
+        sample = read(dev, (EXTENDED | 0x18FEEE00, raw.to_bytes(8, "little")))
+        assert (sample.status[ROLE["air_c"]] == OK) == (raw == good or bits == 12)
+    dev = device(tmp_path, START + signal.replace("2566844158", "801"), [ET1], "{t: air_c}")
+    assert read(dev, (801, b"\xff" * 8)).status[ROLE["air_c"]] == OK
 
 
 def test_of_two_senders_of_a_group_the_first_or_the_named_one_counts(tmp_path):

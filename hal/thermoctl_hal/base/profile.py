@@ -206,12 +206,13 @@ class DbcSource:
     """A signal of a message of the DBC file.
 
     `invalid`: test of another signal of the message that a good reading passes. `sentinels`: raw numbers that
-    mean 'no reading'."""
+    mean 'no reading'; `absent`: those by which J1939 says 'not available' or 'error'."""
 
     message: str
     signal: str
     invalid: Condition | None = None
     sentinels: tuple[float, ...] = ()
+    absent: range = range(0)
 
 
 @dataclass(frozen=True)

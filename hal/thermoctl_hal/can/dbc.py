@@ -66,7 +66,7 @@ class DbcDevice(Device):
             entry[1].append((i, source))
             if source.invalid is not None:
                 entry[2].append(source.invalid.field)
-            if source.sentinels:
+            if source.sentinels or source.absent:
                 entry[2].append(source.signal)
 
     def connect(self) -> None:
@@ -145,7 +145,7 @@ class DbcDevice(Device):
         for i, source, value in readings:
             self._quiet, self._why = 0, ""
             test = source.invalid
-            if raws.get(source.signal) in source.sentinels:
+            if (raw := raws.get(source.signal)) in source.sentinels or raw in source.absent:
                 self.fail(sample, i, f"{source.signal} is {value:g}: no reading")
             elif test is not None and int(raws.get(test.field, test.value)) & test.mask != test.value:
                 self.fail(

@@ -67,7 +67,9 @@ def read_signal(s: Section, spec: BusSpec) -> DbcSource:
     sentinels = tuple(_raw_sentinel(n, signal) for n in k["sentinels"] or ())
     choices: Mapping[Any, object] = {} if signal.is_float else signal.choices or {}
     sentinels += tuple(float(raw) for raw, word in choices.items() if _NO_VALUE.fullmatch(str(word)))
-    return DbcSource(message, signal.name, invalid, sentinels)
+    bits = 0 if signal.is_float or signal.is_signed or not dbc.is_j1939(message) else signal.length
+    absent = range(0xFE << bits - 8, 1 << bits) if bits in (8, 16, 24, 32) else range(0)  # SAE J1939-71
+    return DbcSource(message, signal.name, invalid, sentinels, absent)
 
 
 def message_of(s: Section, spec: Dbc) -> str:
