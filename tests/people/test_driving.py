@@ -46,6 +46,7 @@ HAZARDS = {
     "encoder gone": Fault("disconnect", (ROLE["position_um"],), 0.0, math.inf, 0.0),
     "drive gone": Fault("disconnect", (ROLE["amplifier_state"],), 0.0, math.inf, 0.0),
     "SIGTERM": signal.SIGTERM,
+    "a closed terminal": signal.SIGHUP,
 }
 
 
@@ -90,18 +91,25 @@ def folder(settings, monkeypatch):
     return place
 
 
+@pytest.fixture
+def terminal():
+    """A closed terminal matters, also where the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize("hazard", HAZARDS)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_hazard_while_driving_disables_the_amplifier(command, hazard, folder, running, capsys):
     what = HAZARDS[hazard]
-    watched = Watched(
-        running, what if isinstance(what, Fault) else lambda: os.kill(os.getpid(), signal.SIGTERM)
-    )
+    watched = Watched(running, what if isinstance(what, Fault) else lambda: os.kill(os.getpid(), what))
     assert cli.main(COMMANDS[command]) == 3
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "the amplifier is disabled" in err, err
     rows = np.array(watched.rows)
-    if hazard == "SIGTERM":
+    if not isinstance(what, Fault):
         first = int(np.flatnonzero(rows[:, COMMAND] == arming.DISARM)[0])
     else:  # the tick in which the law names it: for a stale reading, protection.stale_s after the last good one
         first = int(np.flatnonzero(rows[:, STATE] == arming.FAULT)[0])
@@ -113,6 +121,10 @@ def test_a_hazard_while_driving_disables_the_amplifier(command, hazard, folder, 
     assert not any(watched.enabled[first + 2 :]), "and it stays off"
     if isinstance(what, Fault):
         assert status(running.shared)["state"] == "FAULT", "the fault stays for the person to read"
+    elif command == "experiment":
+        kept = Path("move.parquet").read_bytes()
+        assert cli.main(COMMANDS[command]) == 2 and "never overwritten" in capsys.readouterr().err
+        assert Path("move.parquet").read_bytes() == kept
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -63,6 +63,8 @@ def on_rig(
 
     Returns 1 when the user answered no, ENDED when it ended early."""
     schedules.within_limits(settings, [schedule])
+    if path.exists() and not dry_run and not (resume and _progress(path).exists()):
+        raise InputError(f"{path}: exists, and is never overwritten; name another file by --out")
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
         f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
@@ -76,12 +78,16 @@ def on_rig(
     return _record(rig, schedule, path, resume)
 
 
+def _progress(path: Path) -> Path:
+    """Return the file that holds the time that an unfinished recording reached."""
+    return path.with_name(path.name + ".progress")
+
+
 def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
-    """Run a schedule and write the rows. Until its end, a file beside them holds the time reached."""
-    progress_path = path.with_name(path.name + ".progress")
+    """Run a schedule and write the rows; no signal ends it before they are written."""
     earlier, at_s = None, 0.0
-    if resume and progress_path.exists():
-        earlier, at_s = drive.earlier_part(rig, path, float(progress_path.read_text()), print)
+    if resume and _progress(path).exists():
+        earlier, at_s = drive.earlier_part(rig, path, float(_progress(path).read_text()), print)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
     done_s = [at_s]
@@ -93,20 +99,22 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
             print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)
 
     ended = ""
-    try:
-        with keyboard.listening():
+    with keyboard.listening():
+        try:
             for block in rig.run(schedule, show, keyboard, earlier, at_s):
                 blocks.append(block)
-    except experiments.Aborted as e:
-        ended = e.reason
+        except experiments.Aborted as e:
+            ended = e.reason
+        if blocks:
+            rows = np.vstack(blocks)
+            write_table(path, as_table(rows, path, rig.settings.row))
+        if ended:
+            write_text(_progress(path), f"{done_s[0]:.3f}\n")
     if blocks:
-        rows = np.vstack(blocks)
-        write_table(path, as_table(rows, path, rig.settings.row))
         print(f"{path}: {len(rows)} rows")
     if not ended:
-        progress_path.unlink(missing_ok=True)
+        _progress(path).unlink(missing_ok=True)
         return 0
-    write_text(progress_path, f"{done_s[0]:.3f}\n")
     print(
         f"ended after {done_s[0]:.0f} of {schedule.duration_s:.0f} s, the amplifier is disabled: {ended}; "
         f"go on with --resume --out {path}",

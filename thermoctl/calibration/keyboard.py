@@ -12,7 +12,7 @@ from collections.abc import Iterator
 class Keyboard:
     """Pause and end a test from the keyboard.
 
-    Ctrl-C pauses, Enter continues, a second Ctrl-C (or SIGTERM) ends it."""
+    Ctrl-C pauses, Enter continues; a second Ctrl-C, SIGTERM or a terminal that closes ends it."""
 
     def __init__(self, interactive: bool):
         self.interactive, self.paused, self.ended = interactive, False, False
@@ -37,8 +37,10 @@ class Keyboard:
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        """Handle the signals within the context."""
-        before = {n: signal.signal(n, self.interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+        """Handle the signals within the context; under nohup a terminal may close."""
+        ends = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+        handled = [signal.SIGINT, signal.SIGTERM, *ends]
+        before = {n: signal.signal(n, self.interrupt) for n in handled}
         try:
             yield
         finally:
