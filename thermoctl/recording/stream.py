@@ -82,10 +82,10 @@ def open_stream(path: str | Path, columns: Iterable[str] | None = None) -> Strea
             fields = [i for i, name in enumerate(names) if name in wanted]
             source = pa.memory_map(str(path))
             reader = pa.ipc.open_stream(source, options=pa.ipc.IpcReadOptions(included_fields=fields))
-    except pa.ArrowException as e:
+    except pa.ArrowException:
         raise InputError(
-            f"{path}: no recording in it ({str(e).splitlines()[0]}): it is not an Arrow stream, or was "
-            "cut before its first row"
+            f"{path}: no recording in it: it is of another format (`thermoctl recordings import --explain` reads those), "
+            "or was cut before its first row"
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: no recording in it: a name of a column is not text") from None
