@@ -92,19 +92,10 @@ def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
 
 def _rig(settings: Settings, shared: Shared, backend: Backend, start_s: float) -> loops.Axis:
     """Make the rig of one axis, with the estimates of the previous run where they are recent."""
-    rig = loops.Axis(
-        backend,
-        compensator(settings),
-        law_parameters(settings),
-        settings.loop.period_s,
-        shared.ring,
-        shared.mailbox,
-        shared.parameters,
-        shared.state,
-        start_s,
-        shared.make_remarks(settings.loop.period_s),
-        settings.channels,
-    )
+    model, parameters, period_s = compensator(settings), law_parameters(settings), settings.loop.period_s
+    own = (shared.ring, shared.mailbox, shared.parameters, shared.state)
+    remarks, channels = shared.make_remarks(period_s), settings.channels
+    rig = loops.Axis(backend, model, parameters, period_s, *own, start_s, remarks, channels)
     shared.counters[NO_MODEL] = float(not settings.compensation.model)
     _resume(settings, shared, rig)
     return rig
@@ -286,18 +277,11 @@ def make_children(settings: Settings, shared: list[Shared]) -> tuple[Board | Non
         beats = None if beat is None else partial(s.beats, beat)
         return Child(f"{name} {own.axis}".strip(), main, own, s, beats=beats)
 
-    others = [
-        Child(
-            f"poller {group[0].name}",
-            _poller_process,
-            settings,
-            board,
-            group[0].name,
-            beats=partial(board.beat, group[0].roles),
-        )
-        for group in ports(slow)
-        if board is not None
-    ]
+    others: list[Child] = []
+    if board is not None:
+        for device, *_ in ports(slow):
+            name, beats = f"poller {device.name}", partial(board.beat, device.roles)
+            others.append(Child(name, _poller_process, settings, board, device.name, beats=beats))
     for axis in zip(settings.parts, shared, strict=True):
         if settings.recording.enable:
             others.append(child("recorder", _recorder_process, *axis, RECORDER))

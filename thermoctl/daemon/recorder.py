@@ -53,23 +53,12 @@ def law_metadata(
     """Return the data that a replay needs besides the rows, as JSON.
 
     These are the model, the parameters, and the law's state after `tick` (None: a new law)."""
-    return json.dumps(
-        {
-            "version": LAW_VERSION,
-            "period_s": period_s,
-            "generation": generation,
-            "tick": tick,
-            "state": None if state is None else encode(state),
-            "parameters": encode(parameters.pack()),
-            "model": {
-                **{name: getattr(model, name) for name in PLAIN},
-                **{
-                    name: {"shape": getattr(model, name).shape, "values": encode(getattr(model, name))}
-                    for name in ARRAYS
-                },
-            },
-        }
-    )
+    arrays = {name: getattr(model, name) for name in ARRAYS}
+    fields = {name: getattr(model, name) for name in PLAIN}
+    fields |= {name: {"shape": a.shape, "values": encode(a)} for name, a in arrays.items()}
+    head = {"version": LAW_VERSION, "period_s": period_s, "generation": generation, "tick": tick}
+    kept = {"state": None if state is None else encode(state), "parameters": encode(parameters.pack())}
+    return json.dumps(head | kept | {"model": fields})
 
 
 def read_law_metadata(text: str) -> dict[str, Any]:

@@ -62,19 +62,8 @@ def info(path: str | Path) -> Info:
             rows, ends = rows + batch.num_rows, t[-1].as_py()
     said = {f.name: texts(f.metadata) for f in fields}
     columns = tuple((n, m.get("unit", ""), m.get("meaning", "")) for n, m in said.items())
-    return Info(
-        str(path),
-        rows,
-        begins,
-        ends,
-        wall,
-        wall_end,
-        path.stat().st_size,
-        stream.good_bytes,
-        stream.whole,
-        columns,
-        texts(fields.metadata),
-    )
+    size, good, meta = path.stat().st_size, stream.good_bytes, texts(fields.metadata)
+    return Info(str(path), rows, begins, ends, wall, wall_end, size, good, stream.whole, columns, meta)
 
 
 def read_rows(path: str | Path) -> tuple[np.ndarray, str]:

@@ -131,16 +131,11 @@ class Tier:
         self.clock = names.index("t_s")
         self.bits = [i for i, s in enumerate(signals) if s.bits]
         self.ranged = [i for i in range(len(names)) if i != self.clock and i not in self.bits]
-        self.signals = (
-            signals[self.clock],
-            *(signals[i] for i in self.bits),
-            *(signals[i] for i in self.ranged),
-            *(
-                Signal(f"{signals[i].name}_{end}", signals[i].unit, f"{end} of {signals[i].meaning}")
-                for end in ("min", "max")
-                for i in self.ranged
-            ),
-        )
+        mean = [signals[i] for i in self.ranged]
+        ends = [
+            Signal(f"{s.name}_{end}", s.unit, f"{end} of {s.meaning}") for end in ("min", "max") for s in mean
+        ]
+        self.signals = (signals[self.clock], *(signals[i] for i in self.bits), *mean, *ends)
         self._open = np.empty((0, len(names)))
 
     def add(self, rows: np.ndarray, last: bool = False) -> np.ndarray:
@@ -162,15 +157,9 @@ class Tier:
         with np.errstate(invalid="ignore"):
             mean = total / np.where(count > 0, count, np.nan)
         words = np.nan_to_num(rows[:, self.bits]).astype(np.int64)
-        return np.hstack(
-            (
-                rows[starts][:, [self.clock]],
-                np.bitwise_or.reduceat(words, starts, axis=0),
-                mean,
-                np.fmin.reduceat(data, starts, axis=0),
-                np.fmax.reduceat(data, starts, axis=0),
-            )
-        )
+        t, bits = rows[starts][:, [self.clock]], np.bitwise_or.reduceat(words, starts, axis=0)
+        low, high = (f.reduceat(data, starts, axis=0) for f in (np.fmin, np.fmax))
+        return np.hstack((t, bits, mean, low, high))
 
 
 class WriterSettings(Protocol):

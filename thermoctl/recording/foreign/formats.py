@@ -377,21 +377,13 @@ def write_mcap(path: str, table: Table) -> None:
     with open(path, "wb") as f:
         writer = writer_module.Writer(f)
         writer.start(profile="", library="thermoctl")
-        schema = writer.register_schema(
-            "thermoctl",
-            "jsonschema",
-            json.dumps(
-                {
-                    "type": "object",
-                    "properties": {n: {"type": "number", "description": unit.get(n, "")} for n in names},
-                }
-            ).encode(),
-        )
+        numbers = {n: {"type": "number", "description": unit.get(n, "")} for n in names}
+        described = json.dumps({"type": "object", "properties": numbers})
+        schema = writer.register_schema("thermoctl", "jsonschema", described.encode())
         channel = writer.register_channel("/thermoctl", "json", schema)
         writer.add_metadata("thermoctl", table.meta)
         for time_s, row in zip(clock, values, strict=True):
             data = json.dumps({n: v for n, v in zip(names, row.tolist(), strict=True) if v == v}).encode()
-            writer.add_message(
-                channel, log_time=round(time_s * 1e9), publish_time=round(time_s * 1e9), data=data
-            )
+            ns = round(time_s * 1e9)
+            writer.add_message(channel, log_time=ns, publish_time=ns, data=data)
         writer.finish()

@@ -52,15 +52,12 @@ _ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and
 SHOWN = 8192  # number of last bytes that show the digits of the last column
 FEW = 6  # least number of lines that show them
 _STAMPED = re.compile(rb"(?m)^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # Arduino's monitor before each line
-_SUFFIXES = {
-    ".mf4": "mdf",
-    ".mdf": "mdf",
-    ".tdms": "tdms",
-    ".xlsx": "excel",
-    ".xlsm": "excel",
+_SUFFIXES = {".mf4": "mdf", ".mdf": "mdf", ".tdms": "tdms", ".xlsx": "excel", ".xlsm": "excel"}
+_SUFFIXES |= {
     ".parquet": "parquet",
+    ".mat": "mat",
+    **dict.fromkeys((".arrow", ".arrows", ".feather"), "arrow"),
 }
-_SUFFIXES |= {".arrow": "arrow", ".arrows": "arrow", ".feather": "arrow", ".mat": "mat"}
 
 
 def kind_of(path: Path) -> str:
@@ -267,19 +264,13 @@ def _fast(path: Path, text: bytes, dialect: Dialect, how: How) -> Sheet | None:
     body = _body(text, dialect)
     if b"\n#" in body or b"\n%" in body or body[:1] in b"#%":
         body = b"\n".join(x for x in body.splitlines() if not is_comment(x.decode("utf-8")))
-    names = list(dialect.names)
+    names, empty = list(dialect.names), ["", "NaN", "nan", "NAN", "NA", "null"]
+    types = {n: pa.float64() if n in dialect.numeric else pa.string() for n in names}
+    named = pa.csv.ReadOptions(column_names=names)
+    parse = pa.csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True)
+    convert = pa.csv.ConvertOptions(column_types=types, null_values=empty, decimal_point=decimal)
     try:
-        arrow = pa.csv.read_csv(
-            pa.BufferReader(body),
-            pa.csv.ReadOptions(column_names=names),
-            pa.csv.ParseOptions(delimiter=dialect.separator, ignore_empty_lines=True),
-            pa.csv.ConvertOptions(
-                column_types={n: pa.float64() if n in dialect.numeric else pa.string() for n in names},
-                null_values=["", "NaN", "nan", "NAN", "NA", "null"],
-                strings_can_be_null=False,
-                decimal_point=decimal,
-            ),
-        )
+        arrow = pa.csv.read_csv(pa.BufferReader(body), named, parse, convert)
     except pa.ArrowInvalid:
         return None
     if len(arrow) * len(names) > files.MAX_CELLS:
