@@ -436,8 +436,8 @@ hal: {backend: simulated, plant: none}
 def for_stopping(path: str, socket: str = "", axes: Sequence[str] = ()) -> Settings:
     """Return settings that hold the sockets of a file, which may have mistakes elsewhere, or be gone.
 
-    `socket`, `axes`: those of the running daemon, if they are known. The settings serve to disarm and stop it,
-    and nothing else. Raises InputError."""
+    `socket`, `axes`: those of the running daemon, if they are known. The settings serve to disarm and stop
+    it, and nothing else. Raises InputError."""
     file, _, axis = path.rpartition("#") if "#" in path and not Path(path).exists() else (path, "", "")
     text = Path(file).read_text(errors="replace") if Path(file).is_file() else ""
     section = {m[1]: m[0] for m in re.finditer(r"(?ms)^(socket|axes):.*?(?=^[^\s#]|\Z)", text)}

@@ -127,7 +127,7 @@ def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Se
             t = np.full(len(cells), np.nan)
             t[there] = seconds.t
             return replace(seconds, t=t)
-        # `Time (HH)`: a short word or one that counts; a longer one, as `Time (elapsed)`, tells which time it is.
+        # A short word in round brackets is a unit, as in `Time (HH)`. A longer one, as `(elapsed)`, is none.
         written = unit or next(iter(_BRACKETED.findall(name)), None)
         stated, header = unit_of_time(name, unit, is_time), f"{name} [{unit}]" if unit else name
         seconds = clock.from_numbers(cells, stated, named(name) > 0)

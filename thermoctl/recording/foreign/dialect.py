@@ -47,7 +47,7 @@ _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _STATED = re.compile(r"[A-Za-z][^,;\t|:=]{0,60}?\s[:=]\s+\S")  # `Channel : RPM` above a table
 _DECIMALS = re.compile(r"[-+]?\d*[.,]\d+$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
-_THOUSANDS = re.compile(rb"\.(?<!:\d\d\.)\d{3}(?=[;\t\r\n])")  # of 1.050 in a cell, no seconds
+_THOUSANDS = re.compile(rb"\.(?<!:\d\d\.)\d{3}(?=[;\t\r\n])")  # the end of 1.050 in a cell
 _KINDS = {"", *WORDS["kinds"].split()}
 
 
