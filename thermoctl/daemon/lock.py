@@ -84,7 +84,7 @@ def started(settings: Settings) -> Settings:
     file = os.path.abspath(settings.path)
     above = Path(file).parents
     folders = {lock_path(settings).parent, above[0], *(p / "run" for p in above), Path("/run/thermoctl")}
-    for path in (path for folder in folders for path in folder.glob("*.lock")):
+    for path in (path for folder in folders for path in folder.glob("*.lock") if path.is_file()):
         with contextlib.suppress(OSError):  # deleted meanwhile, or another user's
             lines = os.fsdecode(path.read_bytes()).splitlines()
             if lines[1:2] == [file] and _holder(path) is not None:
