@@ -434,9 +434,24 @@ def test_a_count_beside_a_date_is_no_time_of_day(tmp_path, name, scale):
     np.testing.assert_allclose(found.t, 600 * np.arange(6))
 
 
-def test_a_frame_of_can_holds_no_day_and_no_time(tmp_path):
-    with pytest.raises(InputError, match="no other that is a time"):  # candump: 0x123 was the day of the year
-        read(tmp_path, rows(*(f"  can0  123   [4]  {10 + i} 00 00 12" for i in range(8))))
+@pytest.mark.parametrize(
+    ("head", "line"),
+    [
+        ("", "  can0  123   [4]  {0:02X} 00 00 12"),
+        ("", "(1700000000.{0}1834) can0 181#{0}22334455667788"),
+        ("", " (2026-11-14 10:00:{0}.500000)  vcan1  1812F4E5   [3]  {0} 22 33"),
+        ("base hex  timestamps absolute\n", "   0.{0}1834 1  181             Rx   d 4 {0} 22 33 44"),
+        (
+            ";$FILEVERSION=1.1\n;---+--   ----+----\n",
+            "    {0})       {0}.8  Rx         0181  4  {0} 22 33 44",
+        ),
+    ],
+    ids=["candump", "candump -l", "candump -tA", "Vector", "PEAK"],
+)
+def test_frames_of_can_are_no_table(tmp_path, head, line):
+    """A Vector log was columns, with hexadecimal bytes as decimals; of candump 0x123 was the day of the year."""
+    with pytest.raises(InputError, match="frames of a CAN bus.*DBC"):
+        read(tmp_path, head + rows(*(line.format(10 + i) for i in range(8))), "log.asc")
 
 
 def test_names_one_a_line_above_the_table(tmp_path):

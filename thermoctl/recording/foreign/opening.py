@@ -44,6 +44,11 @@ MAGIC = (
     (b"MATLAB ", "mat"),
     (b"\xd0\xcf\x11\xe0", "xls"),
     (b"\x1f\x8b", "gzip"),
+    (b"LOGG", "frames"),
+)
+# Logs of CAN frames: Vector's .asc, PEAK's .trc, candump's.
+_FRAMES = re.compile(
+    rb"(?mi)^(base (hex|dec) +timestamps|;\$FILEVERSION=|\s*(\([-\d.: ]+\)\s+\S+|[vxsl]*can\d+)\s+[0-9A-F]{3,8}(#|\s+\[\d+\]))"
 )
 _QUOTED = re.compile(rb'^"([^"\n]*[,;\t][^"\n]*[,;\t][^"\n]*)"\r?$', re.MULTILINE)  # a row that is one cell
 # The header of a segment of LVM, with the line of names below it.
@@ -79,6 +84,8 @@ def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     how.trace.append(f"format: {kind}")
     if kind in _READERS:
         return [_of_names(s) for s in _READERS[kind](path, how, notes)]
+    if kind == "frames":
+        raise _frames(path)
     if kind == "xls":
         raise InputError(f"{path}: an Excel file of before 2007; save it as .xlsx or .csv")
     if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
@@ -94,6 +101,13 @@ def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     text, said = decoded(path, data)
     notes += said
     return _text(path, text, how, notes)
+
+
+def _frames(path: Path) -> InputError:
+    return InputError(
+        f"{path}: frames of a CAN bus, not the signals in them; decode them by the bus's DBC file first, with "
+        "asammdf or `python -m cantools decode`"
+    )
 
 
 def _of_names(sheet: Sheet) -> Sheet:
@@ -156,6 +170,8 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     """Read a text as sheets: a table of rows, or a layout of its own."""
     if b"\0" in text:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
+    if _FRAMES.search(text[:HEAD]):
+        raise _frames(path)
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
     text = _one_header(text, notes)
