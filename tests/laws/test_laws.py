@@ -20,7 +20,7 @@ from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.diagnose import diagnose, sought
 from thermoctl.diagnosis.evidence.fit import Placed, fitted
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
@@ -444,6 +444,19 @@ def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet(read):
     assert {s.label for term in best.terms for s in term.signals} == {"pumped", "iron - inlet"}
     law = refitted_law(known, null, best, null)
     assert "pumped" in law.plant.inputs and law.fit.rms()["T"] < 0.16
+
+
+def test_a_column_that_a_recording_set_aside_lacks_is_no_signal():
+    """A law of the voltage was found, and then could not be measured there: the diagnosis ended in an error."""
+    plant, t = loads(CLAMP), np.arange(0, 0.2, 0.0008)
+    table, aside = (
+        compile_plant(plant).measure(Table(name, "", t, {"u": np.sin(57 * t)}), 1)
+        for name in ("run", "aside")
+    )
+    table.columns["room"] = np.cos(9 * t)
+    tables = [table]
+    assert "room" in sought(plant, tables, {}, limits()).case.tables[0].columns
+    assert "room" not in sought(plant, tables, {}, limits(), [aside]).case.tables[0].columns
 
 
 @pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])

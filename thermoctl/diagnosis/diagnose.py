@@ -83,11 +83,21 @@ def sought(
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
     (chosen_on, notes), (reserve, _) = (in_pieces(plant, part) for part in split(tables, held_out))
+    chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
     known.notes.extend(notes)
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
+
+
+def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:
+    """Return a recording without the columns that the plant does not read and a reserve lacks.
+
+    An effect or a law of such a column could not be simulated there."""
+    read = {i.column for i in plant.readings()}
+    kept = {c for c in table.columns if c in read or all(c in r.columns for r in reserve)}
+    return replace(table, columns={c: v for c, v in table.columns.items() if c in kept})
 
 
 def decided(sought: Sought) -> Diagnosis:
