@@ -459,6 +459,20 @@ def test_a_column_that_a_recording_set_aside_lacks_is_no_signal():
     assert "room" not in sought(plant, tables, {}, limits(), [aside]).case.tables[0].columns
 
 
+def test_a_second_reading_of_several_bodies_is_no_signal():
+    """A second displacement sensor follows no single body."""
+    reading = "  bent: {value: one - 2 * two, unit: K, noise: 0.05}\n"
+    plant, t = loads(TWO_BLOCKS + reading), np.arange(0, 4000, 4.0)
+    drives = {"heat": 20.0 * (np.sin(t / 300) > 0), "air_temperature": 22 + np.sin(t / 800)}
+    table = compile_plant(plant).measure(Table("run", "", t, drives), 1)
+    table.columns["laser"] = table.columns["bent"] + np.random.default_rng(2).normal(0, 0.05, len(t))
+    table.columns["pressure"] = np.cos(t / 170)
+    known = case(plant, [table], {}, Budget(80))
+    metric = Metric(Plain(known, known.null), fitted(known, plant, (), known.null).average, True)
+    found = signals(known.rig(plant, metric.drives), Place("one"), metric.signals)
+    assert {"laser", "pressure"} & {s.label for s in found} == {"pressure"}
+
+
 @pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])
 def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     pump = "inputs:\n  spare: {unit: V}\n"

@@ -199,7 +199,9 @@ RULES: Mapping[str, Rule] = {
         searches=True,
     ),
     "reading": Rule(
-        "a law depends on no unread column that follows a node", {"law.signals._follows": _no}, searches=True
+        "a law depends on no unread column that follows a node or an output",
+        {"law.signals._follows": _no},
+        searches=True,
     ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "pays": Rule(

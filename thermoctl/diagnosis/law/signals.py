@@ -14,7 +14,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.units import conversion, dimension
 
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
-FOLLOWS = 0.9  # share of a column's variance that a node shows, above which the column may be its reading
+FOLLOWS = 0.9  # share of a column's variance that a node or an output shows, above which it may be a reading
 DRAWS = 5  # number of values of all names for which two rates are compared
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
@@ -177,10 +177,11 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
 
 
 def _follows(column: str, p: Plant, runs: Sequence[Values]) -> bool:
-    """Return whether an unread column follows a node, so that it may be a reading of it.
+    """Return whether an unread column follows a node or an output, so that it may be a reading of it.
 
     A law of such a column would lead the plant to its own recording."""
-    values = [np.concatenate([np.atleast_1d(run[n]) for run in runs]) for n in (column, *p.nodes)]
+    read = [*map(name, (column, *p.nodes)), *(o.value for o in p.outputs.values())]
+    values = [np.concatenate([ex.series(e, run, np.atleast_1d(run["t"])) for run in runs]) for e in read]
     with np.errstate(all="ignore"):
         alike = np.corrcoef(values)[0, 1:] ** 2
     return bool(np.any(alike > FOLLOWS))
