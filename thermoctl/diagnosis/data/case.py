@@ -126,7 +126,7 @@ class Case:
         drives = [dataclasses.replace(model.excitation(t), rtol=self.rtol) for t in self.tables]
         return [dataclasses.replace(d, x0=_start(d, self.null.model, model)) for d in drives]
 
-    def drives_of(self, after: Plant, before: Plant, drives: Sequence[Excitation]) -> Sequence[Excitation]:
+    def drives_after(self, after: Plant, before: Plant, drives: Sequence[Excitation]) -> Sequence[Excitation]:
         """Return the recordings as an extended plant reads them, from those of the plant before.
 
         An effect or a law may read a further column."""
@@ -135,10 +135,9 @@ class Case:
     @cached_property
     def columns(self) -> list[dict[str, np.ndarray]]:
         """Return by recording each column (N,), whether the plant reads it or not, its gaps filled."""
-        some = [{c: v for c, v in t.columns.items() if np.isfinite(v).any()} for t in self.tables]
         return [
-            {c: filled(t.t, v, False, c) for c, v in columns.items()}
-            for t, columns in zip(self.tables, some, strict=True)
+            {c: filled(t.t, v, False, c) for c, v in t.columns.items() if np.isfinite(v).any()}
+            for t in self.tables
         ]
 
     def rig(self, plant: Plant, drives: Sequence[Excitation]) -> Rig:

@@ -60,7 +60,7 @@ def refitted_law(
         c = law_candidate(case.rig(plant, drives), q)
         values, ranges = _start(q)
         plant, before = c.extend(values, ranges), plant
-        drives = case.drives_of(plant, before, drives)
+        drives = case.drives_after(plant, before, drives)
         own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
         effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:

@@ -333,7 +333,7 @@ def remade(
         for e in effects:
             c = found_again(candidates(case.rig(plant, drives), entries), e.key, e.label)
             plant, before = c.extend(e.values, e.ranges), plant
-            drives = case.drives_of(plant, before, drives)
+            drives = case.drives_after(plant, before, drives)
             placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
         return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
     except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
