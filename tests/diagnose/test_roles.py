@@ -252,16 +252,17 @@ def test_what_an_unread_column_sounds_like_is_a_guess_that_is_said():
     assert structure.signals("x") == ["out"]
     assert structure.signals("i") == ["current"]
     notes = structure.guesses()
-    assert any("'current': it is tried in laws and as a current; " in n for n in notes)
-    assert any("'c7': it is tried in laws and as a temperature; " in n for n in notes)
+    assert any("as a current: 'current'; " in n for n in notes)
+    assert any("as a temperature: 'c7'; " in n for n in notes)
     units = {"pos_mm": "position", "gap_um": "position", "spindle_rpm": "velocity", "i_d": "current"}
-    units["possible"] = "temperature"
+    units |= dict.fromkeys(("possible", "ch1", "ch2"), "temperature")
     columns = {n: np.arange(5.0) ** 2 for n in ("drive", *units)} | {"t_ms": 1000 * np.arange(5.0) + 7}
     drive = compile_plant(plant).excitation(Table("run", "run", np.arange(5.0), columns))
     notes = Rig(plant, [drive], [columns]).guesses()
+    unread = [n for n in notes if n.startswith("columns that")]
+    assert len(unread) == len({*units.values()}), "one note for all columns of a kind"
     assert all(
-        any(f"'{n}': it is tried in laws and as a {kind}; " in note for note in notes)
-        for n, kind in units.items()
+        any(f"as a {kind}: " in note and f"'{n}'" in note for note in notes) for n, kind in units.items()
     )
     assert not any("t_ms" in note for note in notes), "the time in another unit is no quantity of the rig"
 

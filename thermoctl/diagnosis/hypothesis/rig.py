@@ -285,13 +285,15 @@ class Rig:
         for v, x in self.pairs.items():
             if _stated(self.physics.nodes[v]) not in MOVING:
                 out.append(f"'{x}' is taken as a position and '{v}' as its velocity, since '{v}' is its rate")
+        unread: dict[str, list[str]] = {}
         for c in self.spare:
             kinds = [MEANINGS[kind] for kind in SOUNDS if c in self.guessed(kind)]
-            out.append(
-                f"the plant does not read the column '{c}': it is tried in laws and as a {' or a '.join(kinds or ['temperature'])}; "
-                "an input with a `role` states what it is"
-            )
-        return out
+            unread.setdefault(" or a ".join(kinds or ["temperature"]), []).append(f"'{c}'")
+        return out + [
+            f"columns that the plant does not read are tried in laws and as a {kinds}: {', '.join(columns)}; "
+            "an input with a `role` states what it is"
+            for kinds, columns in unread.items()
+        ]
 
     def is_motor(self, f: Flow) -> bool:
         """Return whether a flow is a force or a torque that an input or a current drives."""
