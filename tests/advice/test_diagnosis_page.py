@@ -29,6 +29,7 @@ LAW = [
     "share_closed",
     "equivalent",
     "effect",
+    "beside",
 ]
 LOST = ("effect", "where", "beside", "probability", "below_best", "reason")
 ROOT = Path(__file__).parents[2]

@@ -308,7 +308,7 @@ def ours(plant: Plant, d: Drawn) -> tuple[Plant, dict[str, Any]]:
     tables = all_parts(plant, d.tables[:-1])
     found = diagnose(plant, tables, catalogue(), limits())
     names = [f"{e.key[0]} at {e.key[1]}" for e in found.shown]
-    law = str(law_rate(found.law.fitted)) if found.law else None
+    law = str(law_rate(found.law.fitted, found.law.placed)) if found.law else None
     return found.final.plant, {
         "verdict": found.decision.verdict,
         "names": names,

@@ -55,7 +55,7 @@ def effects(draw, doubted=False):
 
 
 @st.composite
-def laws(draw):
+def laws(draw, alone=False):
     """The law of a remainder."""
     k = {"value": draw(sizes), "sd": draw(st.none() | sizes), "unit": "W"}
     return {
@@ -68,6 +68,7 @@ def laws(draw):
         "where": "block",
         "probability": draw(chances),
         "share_closed": draw(chances),
+        "beside": [] if alone else draw(st.lists(laws(alone=True), max_size=1)),
     }
 
 

@@ -52,6 +52,7 @@ FOUND = {
     "hypotheses": [],
     "lost": [],
     "refused": [{"effects": ["creep at v"], "reason": "refitted, and it or a part of it is not significant"}],
+    "placeless": ["orifice_exponent"],
     "promised": {"radiation at block": 3.21, "cogging at v": 1.25},
     "truncated": True,
     "outputs": {"reading": {"unit": "degC", "noise": 0.02}},
@@ -184,6 +185,7 @@ def test_a_diagnosis_needs_its_plant_and_its_folder(tmp_path, capsys):
         ("sensor lag", "sensor_lag at reading: a finding"),
         ("sensor lag at reading", "sensor_lag at reading: a finding"),
         ("creep at w", "creep at w: it promised nothing in any screening"),
+        ("orifice exponent", "orifice exponent: it has no place in this plant; `thermoctl effects show "),
         ("cogging", "cogging at v: not refitted; to first order it gains at most 1.2 nats"),
     ],
 )
@@ -192,8 +194,11 @@ def test_one_line_says_why_an_effect_is_a_finding_or_none(asked, answer):
 
 
 def test_one_line_says_why_of_a_law_that_is_the_result():
-    law = {"remainder": FOUND["remainder"] | {"law": {"where": "block", "probability": 0.97}}}
-    assert why(FOUND | law, "law") == "law at block: found, probability 0.97"
+    other = {"where": "other", "probability": 0.93, "confirmed": 0.95}
+    law = {"where": "block", "probability": 0.97, "confirmed": 0.99, "beside": [other]}
+    both = FOUND | {"remainder": FOUND["remainder"] | {"law": law}}
+    assert why(both, "law") == "law at block: a finding, probability 0.97; that other data confirm it 0.99"
+    assert why(both, "law at other").startswith("law at other: a finding, probability 0.93; ")
 
 
 def test_errors_that_may_be_the_sensors_own_are_not_told_as_something_missing():

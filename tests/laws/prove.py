@@ -78,7 +78,7 @@ def judge(made: Made, full: bool) -> dict[str, Any]:
         "named": named,
         "claimed": law is not None,
         "ratio": made.ratio,
-        "law": str(law_rate(law.fitted)) if law else None,
+        "law": str(law_rate(law.fitted, law.placed)) if law else None,
         "forms": [t.form.name for t in law.proposal.terms] if law else None,
     }
     if made.law is None:

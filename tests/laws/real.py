@@ -53,7 +53,7 @@ def main(folder: Path, names: Sequence[str]) -> None:
         if rig.name in PUBLISHED:
             print(f"published: {PUBLISHED[rig.name]}")
         if law:
-            entry = law_entry(law, d.worth)
+            entry = law_entry([law], d.worth)
             assert entry is not None
             print(f"found: {law_sentence(entry)}")
             print(f"rms: {d.null.fit.rms()} -> {entry['rms']}; energy closed: {d.worth.share_closed:.2f}")

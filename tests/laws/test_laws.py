@@ -30,8 +30,14 @@ from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Term, families, library
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal, propose_laws
-from thermoctl.diagnosis.law.refit import FEWEST_REFITS, SIMPLER, affordable, law_candidate, refitted_law
-from thermoctl.diagnosis.law.refit import law_of as placed_law
+from thermoctl.diagnosis.law.refit import (
+    FEWEST_REFITS,
+    SIMPLER,
+    affordable,
+    law_candidate,
+    laws_of,
+    refitted_law,
+)
 from thermoctl.diagnosis.law.result import law_entry, law_section, save_effect, wrong_ends
 from thermoctl.diagnosis.law.signals import Place, Signal, conversions, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
@@ -73,9 +79,9 @@ def test_a_law_has_its_place_its_variable_and_the_flow_of_the_truth(found):
 
 def test_the_entry_holds_units_and_the_report_draws_the_curve(found):
     _, d, law = found
-    entry = json.loads(json.dumps(law_entry(law, d.worth)))
+    entry = json.loads(json.dumps(law_entry([law], d.worth)))
     assert entry["into"] == "broth" and entry["parameters"]["A1"]["unit"] == "W"
-    page = law_section(law, entry)
+    page = law_section([law], entry)
     assert "<svg" in page and "95 %" in page
 
 
@@ -94,7 +100,7 @@ def test_a_saved_law_is_an_effect_that_finds_its_place(found, tmp_path, capsys):
         "lost": [],
         "refused": [],
         "promised": {},
-        "remainder": {"law": law_entry(law, d.worth)},
+        "remainder": {"law": law_entry([law], d.worth)},
     }
     (tmp_path / "diagnosis.json").write_text(json.dumps(result))
     own = tmp_path / "own"
@@ -255,7 +261,7 @@ def test_a_law_of_a_conversion_acts_in_all_its_flows(tmp_path):
     assert found["algae"] == pytest.approx(-found["grazers"] / 0.6)
     whole = found["grazers"] + 0.6 * own["a"] * x[0] * x[1]
     assert np.std(whole - 0.54 * x[0] ** 2 / (1.6**2 + x[0] ** 2) * x[1]) < 0.05 * np.std(whole)
-    entry = law_entry(d.law, d.worth)
+    entry = law_entry(d.laws, d.worth)
     assert entry["where"] == "gain and grazing" and entry["effect"] is None
     assert ", -(1 / kept) times it into algae, " in law_sentence(entry)
     with pytest.raises(InputError, match="gain and grazing of this plant alone"):
@@ -537,7 +543,7 @@ def switched():
 def test_a_thermostat_with_hysteresis_is_a_law_with_two_thresholds(switched):
     made, d, law = switched
     (term,) = law.proposal.terms
-    values = {q: p["value"] for q, p in law_entry(law, d.worth)["parameters"].items()}
+    values = {q: p["value"] for q, p in law_entry([law], d.worth)["parameters"].items()}
     signal = term.signals[0]
     assert (term.form.name, signal.label) == ("relay", "broth")
     on, off = (signal.centre + values["Z1"] * values[q] for q in ("on1", "off1"))
@@ -547,7 +553,7 @@ def test_a_thermostat_with_hysteresis_is_a_law_with_two_thresholds(switched):
 
 def test_a_saved_relay_is_an_effect(switched, tmp_path):
     made, d, law = switched
-    result = {"remainder": {"law": law_entry(law, d.worth)}}
+    result = {"remainder": {"law": law_entry([law], d.worth)}}
     save_effect(result, "thermostat", tmp_path / "own")
     save(made.plant, tmp_path / "plant.yaml")
     assert main(["effects", "check", str(tmp_path / "own"), "--plant", str(tmp_path / "plant.yaml")]) == 0
@@ -574,7 +580,7 @@ def test_latent_heat_is_a_law_in_the_storage(tmp_path):
     law = next(law for law in STORAGES if law.family == "heater")
     made = make(law, "heater", "middle", "closed", 7)
     d, found = look(made)
-    entry = law_entry(found, d.worth)
+    entry = law_entry([found], d.worth)
     assert (entry["part"], entry["into"]) == ("storage", "one")
     assert difference(found.fitted.plant, made) < EQUAL
     assert law_sentence(entry).startswith("A law for it: a storage of one, C_1 + ")
@@ -645,7 +651,7 @@ def test_a_law_that_recordings_set_aside_do_not_confirm_is_no_finding():
         pytest.skip(f"{FOLDER}: no such folder; set THERMOCTL_RECORDINGS to the folder of the recordings")
     rig = next(r for r in RIGS if r.name == "battery")
     d = law_of(FOLDER, rig, ["voltage"])
-    law = placed_law(d.searched.tried[0].fitted)
+    law = laws_of(d.searched.tried[0].fitted)[0]
     assert {t.form.name: t.variables for t in law.proposal.terms} == {"total_product": {"current"}}
     assert d.law is None and d.refused == {("law", "cell")}
     (told,) = (a["expression"] for a in contract(d)["alternatives"] if a["effect"] == "law")

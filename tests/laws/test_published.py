@@ -2,14 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.bench.laws import smoothed
 from tests.bench.published import plant_of
 from tests.laws.published import SYSTEMS
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.law.result import save_effect
 from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report.words import sentences
+from thermoctl.diagnosis.result import contract
 from thermoctl.plant.files import loads
+from thermoctl.recording.table import Table
 
 
 def test_a_law_stands_without_the_names_that_imitate_it():
@@ -31,6 +36,53 @@ def test_two_laws_missing_at_once_are_found_at_both_places():
     for node, size in (("rabbits", -0.9), ("wolves", 0.8)):
         q = {k: found.final.plant.parameters[f"{k}1_law_{node}"].value for k in "AZW"}
         assert q["A"] / (q["Z"] * q["W"]) == pytest.approx(size, rel=0.01)
+
+
+PHAGES = """
+format: thermoctl-plant/1
+title: bacteria and phages; that they meet is not in the model
+parameters:
+  r: {value: 0.9, range: [0.4, 1.5]}
+  K: {value: 6.5, range: [3, 12]}
+  m: {value: 0.35, range: [0.1, 0.8]}
+nodes:
+  bacteria: {storage: 1, initial: first(density), initial_sigma: 0.1}
+  phages: {storage: 1, initial: first(count), initial_sigma: 0.1}
+flows:
+  growth: {into: bacteria, rate: r * bacteria * (1 - bacteria / K)}
+  decay: {from: phages, rate: m * phages}
+outputs:
+  density: {value: bacteria, noise: 0.05}
+  count: {value: phages, noise: 0.06}
+"""
+
+
+def test_two_laws_are_found_where_one_law_and_a_sensor_imitate_them(tmp_path):
+    """A law of memory at the bacteria and a lag of the count: once found, they ended the search for pairs."""
+    t = np.arange(0.0, 30.0, 0.4)
+
+    def rates(_, x):
+        return x[0] * (1 - x[0] / 6) - 0.6 * x[0] * x[1], 0.21 * x[0] * x[1] - 0.4 * x[1]
+
+    x = solve_ivp(rates, (0, 30), (1.0, 0.5), t_eval=t, rtol=1e-9, atol=1e-9).y
+    rng = np.random.default_rng(3)
+    table = Table(
+        "run", "", t, {"density": x[0] + rng.normal(0, 0.05, 75), "count": x[1] + rng.normal(0, 0.06, 75)}
+    )
+    found = diagnose(loads(PHAGES), [table], catalogue(), limits())
+    assert set(found.decision.named) == {("law", "bacteria"), ("law", "phages")}
+    result = contract(found)
+    (beside,) = result["remainder"]["law"]["beside"]
+    sizes = {}
+    for law in (result["remainder"]["law"], beside):
+        assert [form["form"] for form in law["forms"]] == ["product"]
+        a, z, w = (law["parameters"][q]["value"] for q in ("A1", "Z1", "W1"))
+        sizes[law["where"]] = a / (z * w)
+    assert sizes == {"bacteria": pytest.approx(-0.6, rel=0.1), "phages": pytest.approx(0.21, rel=0.1)}
+    text = " ".join(sentences(result))
+    assert "a law at phages of bacteria and phages and a law at bacteria of bacteria and phages" in text
+    saved = [path.name for path in save_effect(result, "meeting", tmp_path)]
+    assert saved == ["meeting.yaml", "meeting_2.yaml"]
 
 
 def test_the_peers_get_the_flow_that_is_missing():

@@ -181,8 +181,8 @@ def save_law(args: argparse.Namespace) -> int:
             "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
         )
     folder, label = args.files
-    path = save_effect(read(Path(folder)), label, Path((args.effects or ["effects"])[0]))
-    print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
+    for path in save_effect(read(Path(folder)), label, Path((args.effects or ["effects"])[0])):
+        print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
     return 0
 
 

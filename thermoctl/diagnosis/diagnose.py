@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from thermoctl.diagnosis.data.case import Budget, Case, case
@@ -19,7 +19,7 @@ from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
 from thermoctl.diagnosis.law.find import FoundLaw, found_law
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.refit import law_of
+from thermoctl.diagnosis.law.refit import laws_of
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
@@ -151,7 +151,7 @@ def decided(sought: Sought) -> Diagnosis:
         unknown.doubt(decision.verdict, numbers),
         asked,
         families=families(posterior, physics, decision.named, known.catalogue, asked, numbers.name),
-        law=_law(known, tried, best, decision, posterior, asked),
+        laws=tuple(_laws(known, tried, best, decision, posterior, asked)),
     )
     if decision.verdict != "consistent" and not diagnosis.shown and before.node:
         return replace(diagnosis, missing_flow=missing_flow(known, null, before.node))
@@ -187,22 +187,22 @@ def _chosen(
     return (chosen if posterior.something >= numbers.name else frozenset()), posterior, {}
 
 
-def _law(
+def _laws(
     known: Case,
     tried: Mapping[Keys, Weighed],
     best: Fitted,
     decision: Decision,
     posterior: Probabilities,
     asked: Mapping[Key, float],
-) -> FoundLaw | None:
-    """Return the law among the names, with its gain over the best hypothesis without it."""
-    law = law_of(best)
-    if law is None or law.key not in decision.named:
-        return None
-    key, mine = law.key, best.hypothesis.keys
-    without = max((w for keys, w in tried.items() if keys < mine and key not in keys), key=lambda w: w.score)
-    gain = tried[mine].score - without.score
-    return found_law(known, best, law, without.fitted, gain, posterior.effects[key], asked.get(key, 1.0))
+) -> Iterator[FoundLaw]:
+    """Return the laws among the names, each with its gain over the best hypothesis without it."""
+    mine = best.hypothesis.keys
+    for law in laws_of(best):
+        if (key := law.key) in decision.named:
+            fewer = (w for keys, w in tried.items() if keys < mine and key not in keys)
+            without = max(fewer, key=lambda w: w.score)
+            gain, other = tried[mine].score - without.score, without.fitted
+            yield found_law(known, best, law, other, gain, posterior.effects[key], asked.get(key, 1.0))
 
 
 def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:

@@ -19,7 +19,7 @@ from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, spoken
 from thermoctl.diagnosis.law.find import FoundLaw
-from thermoctl.diagnosis.law.refit import PlacedLaw, equation, law_of
+from thermoctl.diagnosis.law.refit import PlacedLaw, equation, laws_of
 from thermoctl.diagnosis.law.result import law_entry, wrong_ends
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
@@ -57,7 +57,7 @@ class Diagnosis:
     - `asked`: for the effects that were tested (verdict/confirm.py), the probability that they are confirmed
     - `families`: effects that imitate each other, of which one is certain (verdict/families.py)
     - `missing_flow`: if nothing is found, the rms of the flow into `before.node` with which the plant fits
-    - `law`: the law among the findings, if any"""
+    - `laws`: the laws among the findings"""
 
     case: Case
     searched: Searched
@@ -74,7 +74,7 @@ class Diagnosis:
     asked: Mapping[Key, float]
     families: tuple[Family, ...] = ()
     missing_flow: float | None = None
-    law: FoundLaw | None = None
+    laws: tuple[FoundLaw, ...] = ()
 
     @property
     def shown(self) -> tuple[Placed, ...]:
@@ -104,9 +104,14 @@ class Diagnosis:
         return self.best.hypothesis.keys if self.decision.row == OVERRULED else frozenset()
 
     @property
+    def law(self) -> FoundLaw | None:
+        """Return the first of the laws."""
+        return next(iter(self.laws), None)
+
+    @property
     def extends(self) -> bool:
         """Return whether the outcome has an effect or a law more than the original plant."""
-        return bool(self.shown) or self.law is not None
+        return bool(self.shown or self.laws)
 
     @property
     def final(self) -> Fitted:
@@ -143,7 +148,7 @@ def curves(d: Diagnosis) -> list[Curve]:
 def contract(d: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json, with `next_experiment`, `not_seen` and `seconds` still empty."""
     keys = {e.key for e in d.shown} - d.of_family.keys()
-    stays = d.law is not None or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
+    stays = bool(d.laws) or d.decision.verdict in ("partly_explained", "unexplained", "ambiguous")
     outputs = d.case.plant.outputs
     return _plain(
         {
@@ -169,7 +174,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
                 "over_noise": d.remainder.over_noise,
                 "node": d.remainder.node,
                 "follows": d.remainder.follows,
-                "law": law_entry(d.law, d.worth),
+                "law": law_entry(d.laws, d.worth),
             }
             if stays
             else None,
@@ -191,6 +196,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             "lost": _lost(d),
             "refused": [{"effects": spoken(keys), "reason": why} for keys, why in d.searched.refused.items()],
             "promised": {f"{e} at {at}": gain for (e, at), gain in sorted(d.searched.promised.items())},
+            "placeless": sorted(d.case.catalogue.keys() - d.searched.where.keys()),
             "not_seen": [],
             "truncated": d.searched.truncated,
             "outliers": [{"recording": r, "column": c, "times": times} for r, c, times in d.case.outliers],
@@ -213,7 +219,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
-        *(wrong_ends(d.case, d.law) if d.law else ()),
+        *(note for law in d.laws for note in wrong_ends(d.case, law)),
         *filter(None, [d.unknown]),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "
@@ -290,8 +296,8 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
 def _expression(d: Diagnosis, key: Key) -> dict[str, str]:
     """Return the likeliest expression of a law, with numbers; nothing for an effect of the catalogue."""
     best = next(w.fitted for w in d.searched.tried if key in w.fitted.hypothesis.keys)
-    law = law_of(best)
-    return {"expression": equation(best, numbers=True)} if law and law.key == key else {}
+    law = next((law for law in laws_of(best) if law.key == key), None)
+    return {"expression": equation(best, law, numbers=True)} if law else {}
 
 
 def _of_family(d: Diagnosis, f: Family) -> dict[str, Any]:
@@ -409,8 +415,7 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
     """Return the fitted effects that are not findings, each in its best hypothesis, with the reason."""
     out: dict[Key, dict[str, Any]] = {}
     shown = {e.key for e in d.shown} - d.of_family.keys()
-    if d.law is not None:
-        shown |= {d.law.placed.key}
+    shown |= {law.placed.key for law in d.laws}
     for w in d.searched.tried:
         keys = w.fitted.hypothesis.keys
         for key in sorted(keys - shown - out.keys()):

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
-from thermoctl.diagnosis.report.explain import NOWHERE, explain, why
+from thermoctl.diagnosis.report.explain import NOTHING, explain, why
 from thermoctl.files.yamlfile import InputError, suggest
 
 
@@ -22,7 +22,7 @@ def explained(folder: str, effect: str | None = None, own: Sequence[str] = ()) -
     Raises InputError where there is none, and for a name that is no effect."""
     result = read(Path(folder))
     answer = why(result, effect) if effect else explain(result)
-    if effect and answer.endswith(NOWHERE):
+    if effect and answer.endswith(NOTHING):
         known = catalogue((CATALOGUE, CATALOGUE.parent / "mistakes", *map(Path, own)))
         asked = effect.partition(" at ")[0].replace(" ", "_")
         if asked not in known:

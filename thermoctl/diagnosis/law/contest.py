@@ -22,17 +22,7 @@ from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import (
-    BEATEN,
-    NEAR,
-    SURPLUS,
-    Search,
-    Searched,
-    Weighed,
-    grow,
-    searched,
-    swap,
-)
+from thermoctl.diagnosis.search.beam import BEATEN, NEAR, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
@@ -70,8 +60,7 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         goal = Goal(least, NEAR if quiet else 0.0, quiet)
         done = case.budget.fits_done
         _compete(s, _laws(case, parent, alone, goal, limits, say), done)
-    found = any(key[0] == LAW for key in s.best.fitted.hypothesis.keys)
-    if not found and not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
+    if not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
         say("looking for laws at two places")
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
@@ -161,16 +150,16 @@ def _laws(
         tried = refits(case, base.fitted, some, replace(goal, least=tuple(x + more for x in goal.least)), say)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
-    groups = [(parent, refitted(parent, proposals))]
+    groups = [refitted(parent, proposals)]
     if parent is not alone:
         more, plant = parent.score - alone.score, alone.fitted.plant
         known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
         single = [p for p in proposals if len(p.terms) == 1]
         stands = [p for p in single if known >= {*p.place.nodes, *_names(p)}]
-        groups.append((alone, refitted(alone, [replace(p, promise=p.promise + more) for p in stands])))
+        groups.append(refitted(alone, [replace(p, promise=p.promise + more) for p in stands]))
     found = (
-        _best([x for x in some if x[0].place == place], base, limits)
-        for base, some in groups
+        _best([x for x in some if x[0].place == place], limits)
+        for some in groups
         for place in {p.place: 0 for p, _ in some}
     )
     return [w for w in found if w]
@@ -181,12 +170,11 @@ def _names(p: Proposal) -> set[str]:
     return {n for t in p.terms for s in t.signals for n in ex.names(s.value)}
 
 
-def _best(laws: Sequence[tuple[Proposal, Weighed]], base: Weighed, limits: Thresholds) -> Weighed | None:
-    """Return the likeliest law at one place. Its `rivals` are the others that fit about as well.
+def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed | None:
+    """Return the likeliest law at one place whose parts are significant; None if there is none.
 
-    As in the search of the catalogue, one with an insignificant part has to be SURPLUS above all others."""
-    simplest = max([base.score, *(w.score for _, w in laws if not w.fitted.doubtful)])
-    laws = [(p, w) for p, w in laws if not w.fitted.doubtful or w.score > simplest + SURPLUS]
+    Its `rivals` are the others that fit about as well."""
+    laws = [(p, w) for p, w in laws if not w.fitted.doubtful]
     if not laws:
         return None
     share = softmax(np.array([w.score for _, w in laws]))

@@ -95,7 +95,7 @@ def found_law(
 ) -> FoundLaw:
     """Return the law of a hypothesis with its curve. `parent`: the hypothesis without it."""
     p = law.proposal
-    drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f), f.plant)
+    drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f, law), f.plant)
     return FoundLaw(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
 
 

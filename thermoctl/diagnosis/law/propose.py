@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +52,8 @@ TERMS = 3
 ZOOMED, ZOOMS, FINE = 20, 2, 9
 CHUNK = 256  # number of terms whose responses are computed at a time
 NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
-EACH, COUPLES = 8, 6  # number of terms of each law of a pair; number of pairs
+# Number of terms of each law of a pair; number of pairs, and of those that hold the same law.
+EACH, COUPLES, SHARED = 8, 6, 2
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
 
 
@@ -143,7 +145,8 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     """Return pairs of laws with one term each, at two nodes, best first. Raises SimulationError.
 
     There is no pair if free flows into two nodes are less than NEEDED above those into one. Each law is
-    proposed beside a free flow into the node of the other. Both laws state the promise of the pair."""
+    proposed beside a free flow into the node of the other. Both laws state the promise of the pair. Promises
+    of pairs with one law in common err together: so few of them are returned."""
     rig, where, linear = linearised(case, parent)
     likely = linear.likely[:NODES]
     couples = {(a, b): linear.flows((a, b)) for a, b in itertools.combinations(likely, 2)}
@@ -168,7 +171,12 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
             Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
         )
         out.append((next(laws), next(laws)))
-    return sorted(out, key=lambda p: p[0].cost + p[1].cost - p[0].promise)[:COUPLES]
+    kept, held = list[tuple[Proposal, Proposal]](), Counter[Any]()
+    for pair in sorted(out, key=lambda p: p[0].cost + p[1].cost - p[0].promise):
+        if all(held[p.kind] < SHARED for p in pair):
+            kept.append(pair)
+            held.update(p.kind for p in pair)
+    return kept[:COUPLES]
 
 
 def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:

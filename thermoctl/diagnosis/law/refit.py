@@ -42,9 +42,9 @@ class PlacedLaw(Placed):
         return -self.proposal.cost
 
 
-def law_of(f: Fitted) -> PlacedLaw | None:
-    """Return the last law of a hypothesis, None where it holds none."""
-    return next((e for e in reversed(f.hypothesis.effects) if isinstance(e, PlacedLaw)), None)
+def laws_of(f: Fitted) -> list[PlacedLaw]:
+    """Return the laws of a hypothesis, the last one first."""
+    return [e for e in reversed(f.hypothesis.effects) if isinstance(e, PlacedLaw)]
 
 
 def refitted_law(
@@ -146,10 +146,8 @@ def affordable(case: Case, parent: Fitted) -> int:
     return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, PROPOSALS + SIMPLER))
 
 
-def law_rate(f: Fitted) -> ex.Expr:
-    """Return the expression of the flow or storage that contains the last law of a hypothesis."""
-    law = law_of(f)
-    assert law is not None
+def law_rate(f: Fitted, law: PlacedLaw) -> ex.Expr:
+    """Return the expression of the flow or storage that contains a law of a hypothesis."""
     own, nodes = set(law.own.values()), law.candidate.place.nodes
     if "storage" in law.candidate.effect.changes[0][-1]:
         return f.plant.nodes[nodes["target"]].storage
@@ -162,11 +160,9 @@ def at_bound(f: Fitted) -> bool:
     return any(set(names) & f.fit.at_bound.keys() for names in own)
 
 
-def equation(f: Fitted, numbers: bool = False) -> str:
-    """Return the flow of the last law of a hypothesis with its parameters' short names or numbers."""
-    law = law_of(f)
-    assert law is not None
-    c, text, values = law.candidate, readable(law_rate(f)), f.plant.parameters
+def equation(f: Fitted, law: PlacedLaw, numbers: bool = False) -> str:
+    """Return the flow of a law of a hypothesis with its parameters' short names or numbers."""
+    c, text, values = law.candidate, readable(law_rate(f, law)), f.plant.parameters
     for q in c.effect.parameters:
         own = c.own(q.name)
         short = own if q.name in {*f.plant.nodes, *f.plant.inputs} else q.name

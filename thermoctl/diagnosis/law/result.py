@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.forms import MARK
 from thermoctl.diagnosis.law.propose import Proposal
-from thermoctl.diagnosis.law.refit import equation, law_rate
+from thermoctl.diagnosis.law.refit import equation, law_rate, laws_of
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
-from thermoctl.diagnosis.report.words import law_sentence
+from thermoctl.diagnosis.report.words import every_law, law_sentence
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
@@ -31,15 +31,16 @@ from thermoctl.report.page import BLUE, FAINT, GREY, panel, panels, table, unit
 SAME = 0.05  # largest difference of two flows that are taken for one, over their size
 
 
-def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
-    """Return `remainder.law` of diagnosis.json."""
-    if law is None:
+def law_entry(laws: Sequence[FoundLaw], worth: Worth) -> dict[str, Any] | None:
+    """Return `remainder.law` of diagnosis.json: the first law, with the others `beside` it."""
+    if not laws:
         return None
+    law, *others = laws
     f, p, place = law.fitted, law.proposal, law.proposal.place
     return {
         "where": place.where,
         "part": place.part,
-        "expression": equation(f),
+        "expression": equation(f, law.placed),
         "into": place.target,
         "from": place.source,
         "shares": {node: str(share) for node, share in place.shares},
@@ -56,6 +57,7 @@ def law_entry(law: FoundLaw | None, worth: Worth) -> dict[str, Any] | None:
         "held_out": worth.reserved,
         "equivalent": family(law),
         "effect": None if place.flows else effect_file(law),
+        "beside": [law_entry([other], worth) for other in others],
     }
 
 
@@ -99,13 +101,13 @@ def family(law: FoundLaw) -> list[str]:
 
 def described(p: Proposal, f: Fitted) -> str:
     """Return a law as an expression with numbers, and its place."""
-    return f"{equation(f, numbers=True)} at {p.place.where}"
+    return f"{equation(f, laws_of(f)[0], numbers=True)} at {p.place.where}"
 
 
 def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
     """Return a sentence for a flow of the plant that the law only leads to, or takes from, another node."""
     place, model, fit = law.proposal.place, law.fitted.fit.model, law.fitted.fit
-    own, out = law_rate(law.fitted), []
+    own, out = law_rate(law.fitted, law.placed), []
     for f in model.plant.flows.values():
         if not place.source or (f.target == place.source) == (f.source == place.target):
             continue
@@ -126,17 +128,24 @@ def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
     return out
 
 
-def law_section(law: FoundLaw | None, entry: Mapping[str, Any] | None) -> str:
-    """Return the report's section: the law, its parameters, its family, and the curve with its band."""
-    if law is None or entry is None:
+def law_section(laws: Sequence[FoundLaw], entry: Mapping[str, Any] | None) -> str:
+    """Return the report's section: each law, its parameters, its family, and the curve with its band."""
+    if entry is None:
         return ""
+    drawn = (_drawn(law, e) for law, e in zip(laws, every_law(entry), strict=True))
+    return (
+        "".join(drawn)
+        + "<p>thermoctl effects save DIR NAME writes each as an effect of your own catalogue.</p>"
+    )
+
+
+def _drawn(law: FoundLaw, entry: Mapping[str, Any]) -> str:
     body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
     heads, rows = parameter_rows(entry)
     body += table(heads, [(n, value, unit(of)) for n, value, of in rows])
     if entry["equivalent"]:
         body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["equivalent"]) + "</ul>"
-    saved = "<p>thermoctl effects save DIR NAME writes it as an effect of your own catalogue.</p>"
-    return body + _drawing(law) + saved
+    return body + _drawing(law)
 
 
 def _drawing(law: FoundLaw) -> str:
@@ -241,23 +250,29 @@ def _symbols(law: FoundLaw, plant: Plant) -> tuple[str, dict[str, str], dict[str
     return "node", {"target": "n"}, {target: name("n")}
 
 
-def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> Path:
-    """Write the law of a diagnosis as an effect file of this name, and return its path. Raises InputError."""
-    law = (result.get("remainder") or {}).get("law")
-    if not law:
+def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> list[Path]:
+    """Write the laws of a diagnosis as effect files, and return their paths. Raises InputError.
+
+    The first has this name, the next one the same with _2."""
+    laws = every_law((result.get("remainder") or {}).get("law"))
+    if not laws:
         raise InputError(
             "this diagnosis has no law to save; one with `remainder.law` in diagnosis.json was expected"
         )
     if not label.isidentifier():
         raise InputError(f"'{label}': a name of letters, digits and _ was expected, such as windage")
-    if not law["effect"]:
-        raise InputError(
-            f"the law acts in the flows {law['where']} of this plant alone; a law in one flow or storage was expected"
-        )
+    for law in laws:
+        if not law["effect"]:
+            raise InputError(
+                f"the law acts in the flows {law['where']} of this plant alone; a law in one flow or storage was expected"
+            )
     make_folder(folder)
-    path = folder / f"{label}.yaml"
-    if path.exists():
-        raise InputError(f"{path}: exists already; another name or folder (--effects) was expected")
-    effect = {**law["effect"], "effect": label}
-    write_text(path, yaml.safe_dump(effect, sort_keys=False, allow_unicode=True))
-    return path
+    names = [label, *(f"{label}_{k}" for k in range(2, len(laws) + 1))]
+    paths = [folder / f"{own}.yaml" for own in names]
+    for path in paths:
+        if path.exists():
+            raise InputError(f"{path}: exists already; another name or folder (--effects) was expected")
+    for law, own, path in zip(laws, names, paths, strict=True):
+        effect = {**law["effect"], "effect": own}
+        write_text(path, yaml.safe_dump(effect, sort_keys=False, allow_unicode=True))
+    return paths

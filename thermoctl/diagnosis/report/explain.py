@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from thermoctl.diagnosis.report import figures
-from thermoctl.diagnosis.report.words import what_next
+from thermoctl.diagnosis.report.words import every_law, what_next
 
-NOWHERE = (
-    ": it promised nothing in any screening, or has no place in this plant (`thermoctl effects` lists names)"
-)
+NOTHING = ": it promised nothing in any screening, or has not this place (`thermoctl effects` lists names)"
 SHOWN, LOST = 4, 3  # largest number of hypotheses; largest number of effects that were tried and lost
 
 
@@ -43,13 +41,11 @@ def why(result: Mapping[str, Any], asked: str) -> str:
         plain = entry.replace("_", " ")
         return spoken in (plain, plain.partition(" at ")[0])
 
-    for f in result["findings"]:
+    laws = every_law((result["remainder"] or {}).get("law"))
+    for f in (*result["findings"], *({"effect": "law", **law} for law in laws)):
         if is_asked(name := f"{f['effect']} at {f['where']}"):
             sure, confirmed = (figures.chance(f[k]) for k in ("probability", "confirmed"))
             return f"{name}: a finding, probability {sure}; that other data confirm it {confirmed}"
-    law = (result["remainder"] or {}).get("law")
-    if law and is_asked(name := f"law at {law['where']}"):
-        return f"{name}: found, probability {figures.chance(law['probability'])}"
     for e in result["lost"]:
         if is_asked(name := f"{e['effect']} at {e['where']}"):
             beside = f" beside {' and '.join(e['beside'])}" if e["beside"] else ""
@@ -65,4 +61,7 @@ def why(result: Mapping[str, Any], asked: str) -> str:
     if promised:
         name = max(promised, key=lambda n: promised[n])
         return f"{name}: not refitted; to first order it gains at most {promised[name]:.1f} nats, others promised more"
-    return f"{asked}{NOWHERE}"
+    name = asked.partition(" at ")[0].replace(" ", "_")
+    if name in result.get("placeless", ()):
+        return f"{asked}: it has no place in this plant; `thermoctl effects show {name}` says where it acts"
+    return f"{asked}{NOTHING}"

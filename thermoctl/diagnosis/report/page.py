@@ -48,7 +48,7 @@ def write_report(diagnosis: Diagnosis, result: Mapping[str, Any], path: str | Pa
             "The likeliest" if result["verdict"] == "ambiguous" else "What was found",
             _findings(diagnosis, result),
         ),
-        ("A law for what remains", law_section(diagnosis.law, law)),
+        ("A law for what remains", law_section(diagnosis.laws, law)),
         ("How well it fits", _worth(result) + rest),
         ("The error that is left", _remains(drawn, result)),
         ("Where", _place(diagnosis, result)),

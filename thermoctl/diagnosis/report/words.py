@@ -45,9 +45,9 @@ def words(result: Result) -> str:
 def sentences(result: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
     rows = outputs(result)
-    law = law_sentence((result["remainder"] or {}).get("law"))
-    texts = [_found(result, rows), *_families(result), law]
-    if rows and (result["findings"] or law):
+    laws = [law_sentence(law) for law in every_law(_law(result))]
+    texts = [_found(result, rows), *_families(result), *laws]
+    if rows and (result["findings"] or laws):
         texts.append(_gain(result, max(rows, key=lambda o: o.gain)))
     return [_places(text, result) for text in (*texts, _remainder(result, rows)) if text]
 
@@ -106,10 +106,17 @@ def listed(items: Sequence[str]) -> str:
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
-def law_sentence(entry: Result | None) -> str:
-    """Return a sentence on the law of the remainder; '' without one."""
-    if not entry:
-        return ""
+def every_law(entry: Result | None) -> list[Result]:
+    """Return the law of the remainder and those beside it; none for None."""
+    return [entry, *entry.get("beside", ())] if entry else []
+
+
+def _law(result: Result) -> Result | None:
+    return (result["remainder"] or {}).get("law")
+
+
+def law_sentence(entry: Result) -> str:
+    """Return a sentence on a law of the remainder."""
     values = ", ".join(
         f"{n} = {with_interval(p['value'], p['sd'], p['unit'])} {p['unit'] or ''}".removesuffix(" 1").strip()
         for n, p in entry["parameters"].items()
@@ -160,10 +167,8 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
     if named := [f for f in result["findings"] if "members" not in f]:
         names = [f"{name(f)} (probability {chance(f['probability'])})" for f in named]
         return f"Found: {listed(names)}."
-    law = (result["remainder"] or {}).get("law")
-    if law:
-        follows = f"; it follows {listed(law['of'])}" if law["of"] else ""
-        return f"Found: a law at {law['where']} that no effect of the catalogue is{follows}."
+    if laws := every_law(_law(result)):
+        return f"Found: {listed([_unknown(law) for law in laws])}, which no effect of the catalogue is."
     why = next((a["why_not"] for a in result["alternatives"] if a.get("why_not")), "")
     doubted = listed([name(a) for a in result["alternatives"] if why and a.get("why_not") == why][:2])
     fits = f" What would fit, though {why}: {doubted}." if doubted else ""
@@ -179,6 +184,10 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
     else:
         what = "Something is missing"
     return f"{what}.{fits}" if fits else f"{what} that no effect of the catalogue explains."
+
+
+def _unknown(law: Result) -> str:
+    return f"a law at {law['where']}" + (f" of {listed(law['of'])}" if law["of"] else "")
 
 
 def _families(result: Result) -> list[str]:
@@ -211,7 +220,7 @@ def _doubt(alternative: Result) -> str:
 
 
 def _gain(result: Result, o: Output) -> str:
-    many = len(result["findings"]) + bool((result["remainder"] or {}).get("law")) > 1
+    many = len(result["findings"]) + len(every_law(_law(result))) > 1
     likely = f"With the likeliest{' ones' if many else ''}" if result["verdict"] == "ambiguous" else ""
     came = o.size("before")
     alone = f"{o.size('refit_only')} after a refit alone" + (f" ({came} as the plant came)" if came else "")
