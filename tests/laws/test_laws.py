@@ -452,6 +452,41 @@ def test_a_coolant_takes_heat_as_its_flow_times_its_distance_to_the_inlet(read):
     assert "pumped" in law.plant.inputs and law.fit.rms()["T"] < 0.16
 
 
+FOLLOWER = """\
+format: thermoctl-plant/1
+title: A car that follows another one
+inputs:
+  v_lead: {unit: m/s, between_samples: linear}
+parameters:
+  k: {value: 0.06, unit: 1/s**2, range: [0.01, 0.3]}
+  headway: {value: 1.5, unit: s}
+nodes:
+  v: {unit: m/s, storage: 1, initial: 20, initial_sigma: 0.2}
+  gap: {unit: m, storage: 1, initial: 30, initial_sigma: 0.5}
+flows:
+  keep: {into: v, rate: k * (gap - 4 - headway * v), unit: m/s**2}
+  close: {into: gap, rate: v_lead - v, unit: m/s}
+outputs:
+  speed: {value: v, unit: m/s, noise: 0.05}
+  radar: {value: gap, unit: m, noise: 0.1}
+"""
+
+
+def test_a_flow_may_go_with_a_quotient_and_with_the_distance_to_an_input():
+    """Neither was in the library: a sum of two exponentials of the speeds had been found instead."""
+    plant, t = loads(FOLLOWER), np.arange(0.0, 240.0, 0.4)
+    closing = Flow("closing", ex.parse("9 * (v_lead - v) / gap"), None, "v")
+    truth = compile_plant(replace(plant, flows={**plant.flows, "closing": closing}))
+    table = truth.measure(Table("run", "", t, {"v_lead": 20 + 4 * np.sin(t / 6) + 3 * np.sin(t / 31)}), 1)
+    known = case(plant, [table], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    best = propose_laws(known, null, limits())[0]
+    assert {s.label for term in best.terms for s in term.signals} == {"gap", "v - v_lead"}
+    law = refitted_law(known, null, best, null)
+    assert law.plant.parameters["n1_law_v"].value == pytest.approx(-1, abs=0.05)
+    assert law.fit.rms()["speed"] < 0.055
+
+
 def test_a_column_that_a_recording_set_aside_lacks_is_no_signal():
     """A law of the voltage was found, and then could not be measured there: the diagnosis ended in an error."""
     plant, t = loads(CLAMP), np.arange(0, 0.2, 0.0008)
@@ -494,7 +529,8 @@ def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     null = fitted(known, plant, (), known.null)
     led = [p for p in propose_laws(known, null, limits()) if p.place == Place("lower", "upper")]
     led = [p for p in led if [(x.form.name, *x.variables) for x in p.terms] == [("linear", "spare")]]
-    law = SimpleNamespace(proposal=led[0], fitted=refitted_law(known, null, led[0], null))
+    moving = refitted_law(known, null, led[0], null)
+    law = SimpleNamespace(proposal=led[0], fitted=moving, placed=laws_of(moving)[0])
     (told,) = wrong_ends(known, law)
     assert "start at upper, and not lower" in told if drains else "end in lower, and not upper" in told
 
