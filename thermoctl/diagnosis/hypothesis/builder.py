@@ -183,8 +183,8 @@ class _Builder:
 
     def _unit(self, text: str | None) -> str | None:
         """Return the unit of a parameter; None where the plant does not state a unit that it depends on."""
-        if text is None:
-            return None
+        if text is None or not self.c.effect.where:  # a law states the units of this plant
+            return text
         node = self.place.nodes.get("v") or self.place.nodes.get("a")
         flows = (f for f in self.base.flows.values() if node and node in (f.source, f.target))
         rate = next((f.unit for f in flows if f.unit), None)
@@ -197,14 +197,18 @@ class _Builder:
                 if unit is None:
                     return None
                 text = text.replace(key, "K" if unit in TEMPERATURE and text != key else unit)
-        return re.sub(r"\b(?=[WJ]\b)", self._prefix(), text)
+        return self._in_heat(text)
 
-    def _prefix(self) -> str:
-        """Return the SI prefix of the heat flows at the place ("m" for mW), or ""."""
+    def _in_heat(self, text: str) -> str:
+        """Return a unit with W and J as the heat flows at the place have them: mW and mJ, W/m^2 and J/m^2."""
         flow = self.base.flows.get(self.place.flow or "")
         ends = {*self.place.nodes.values(), *((flow.source, flow.target) if flow else ())}
-        units = (f.unit or "" for f in self.base.flows.values() if {f.source, f.target} & ends - {None})
-        return next((u[:-1] for u in units if kind_of(u) == "power" and u.endswith("W")), "")
+        units = [f.unit for f in self.base.flows.values() if f.unit and {f.source, f.target} & ends - {None}]
+        if heat := next((u for u in units if kind_of(u) == "power" and u.endswith("W")), None):
+            return re.sub(r"\b(?=[WJ]\b)", heat[:-1], text)
+        if not units or kind_of(units[0]) == "power":
+            return text
+        return re.sub(r"\bJ\b", f"({units[0]}) * s", re.sub(r"\bW\b", f"({units[0]})", text))
 
     def expression(self, text: str | float) -> Expr:
         """Return an expression of the catalogue with its symbols replaced by the plant's expressions."""

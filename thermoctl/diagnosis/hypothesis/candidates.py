@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from thermoctl.diagnosis.hypothesis.builder import Candidate as Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, Place, askable
+from thermoctl.diagnosis.hypothesis.places import FAULTS, PLACES, Place, askable, displacements
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
@@ -38,20 +38,28 @@ def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:
     return choices
 
 
-def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
-    """Return every effect at every place where it can act, with every choice of the signals it needs.
+def _placed(rig: Rig, effect: Effect) -> Iterator[tuple[Place, Effect]]:
+    """Yield the places where an effect can act, each with the entry for it.
 
-    A reading that the plant trusts has no fault."""
+    A reading that the plant trusts has no fault. Without an ambient nothing reads it. What does not grow has
+    no lag of its growth."""
+    if effect.in_air and not rig.air:
+        return
+    for place in PLACES[effect.where](rig):
+        here = effect.at(place.exponent)
+        trusted = effect.where in FAULTS and rig.plant.trusts(place.where)
+        still = effect.where == "displacement" and not effect.needs and place not in displacements(rig)
+        if here and askable(rig, place) and not (trusted or still):
+            yield place, here
+
+
+def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
+    """Return every effect at every place where it can act, with every choice of the signals it needs."""
     out = []
     for effect in effects.values():
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
-        for place in PLACES[effect.where](rig):
-            here = effect.at(place.exponent)
-            if here is None or not askable(rig, place):
-                continue
-            if effect.where in FAULTS and rig.plant.trusts(place.where):
-                continue
+        for place, here in _placed(rig, effect):
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(_choices(rig, effect, place)):
                     for which, begins in _clocks(rig, effect).items():

@@ -9,6 +9,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -131,6 +132,12 @@ class Effect:
     prior: Expr | None = None  # -2 log prior of its parameters, inside their bounds
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # names of nodes and inputs that it reads: an effect for one plant
+
+    @cached_property
+    def in_air(self) -> bool:
+        """Does it read the ambient?"""
+        origins = any(p.origin == "first_air" for p in self.parameters)
+        return origins or bool(re.search(r"\b(first_)?air\b", str(self.changes)))
 
     def at(self, exponent: float | None) -> Effect | None:
         """Return the entry for an outlet with this exponent in the plant file; None outside its bounds."""

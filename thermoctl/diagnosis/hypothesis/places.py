@@ -160,25 +160,35 @@ def _passive(rig: Rig) -> Iterator[Place]:
 
 def _in_moving_air(rig: Rig) -> Iterator[Place]:
     if rig.air in rig.moving_inputs:
-        places = (*_sensors(rig, "temperature"), *_displacements(rig))
+        places = (*_sensors(rig, "temperature"), *displacements(rig))
         yield from (p for p in places if p.where != rig.air)
 
 
-def _displacements(rig: Rig) -> Iterator[Place]:
-    warm = set(rig.temperatures) | set(rig.heat_inputs)
-    for o in rig.physics.outputs.values():
-        if rig.kind(o) == "length" and ex.names(o.value) & warm:
-            yield Place(o.name, {"y": o.value}, output=o.name)
+def displacements(rig: Rig) -> list[Place]:
+    """Return the lengths that depend on temperatures."""
+    warm = {*rig.temperatures, *rig.heat_inputs}
+    return [p for p in _sensors(rig, "length") if p.output and ex.names(p.symbols["y"]) & warm]
+
+
+def _lengths(rig: Rig) -> list[Place]:
+    """Return the displacements; where there is none, all lengths of a rig that warms up: any may grow.
+
+    Growth that lags is a node of its own, which a temperature drives."""
+    warm = {*rig.temperatures, *rig.heat_inputs}
+    driven_by = [(f.target, ex.names(f.rate)) for f in rig.physics.flows.values()]
+    grown = {n for n, read in driven_by if read & warm}
+    every = [p for p in _sensors(rig, "length") if p.output and not ex.names(p.symbols["y"]) & grown]
+    return displacements(rig) or (every if warm else [])
 
 
 def _members(rig: Rig) -> Iterator[Place]:
-    for displacement in _displacements(rig):
+    for displacement in _lengths(rig):
         for node in rig.signals("T"):
             yield Place(node, {**displacement.symbols, "T": name(node)}, output=displacement.output)
 
 
 def _bending_pairs(rig: Rig) -> Iterator[Place]:
-    for displacement in _displacements(rig):
+    for displacement in _lengths(rig):
         for a, b in combinations(rig.signals("T"), 2):
             symbols = {**displacement.symbols, "TA": name(a), "TB": name(b)}
             yield Place(f"{a}-{b}", symbols, output=displacement.output)
@@ -271,7 +281,7 @@ FAULTS = (*ERRORS, "reading_in_air")  # places that a trusted reading is not (`P
 PLACES = {
     "node": lambda rig: _nodes(_storing(rig), "n"),
     "node_pair": _exchanging,
-    "temperature_node": lambda rig: _nodes(rig.temperatures if rig.air else (), "T"),
+    "temperature_node": lambda rig: _nodes(rig.temperatures, "T"),
     "velocity_node": lambda rig: _nodes(rig.velocities, "v"),
     "conductance": _conductances,
     "temperature_pair": _pairs,
@@ -286,7 +296,7 @@ PLACES = {
     "recorded_input": lambda rig: (p for p in _sensors(rig) if p.input),
     "reading_in_air": _in_moving_air,
     "position_sensor": lambda rig: _sensors(rig, "length"),
-    "displacement": _displacements,
+    "displacement": _lengths,
     "member": _members,
     "bending_pair": _bending_pairs,
     "voltage_sensor": _voltages,

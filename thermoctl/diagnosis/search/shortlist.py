@@ -10,7 +10,7 @@ import numpy as np
 from thermoctl.diagnosis.evidence.fit import Placed
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate, Key
-from thermoctl.diagnosis.hypothesis.places import PLACES
+from thermoctl.diagnosis.hypothesis.places import displacements
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
 from thermoctl.diagnosis.search.metric import Metric
@@ -29,7 +29,7 @@ def relabels(c: Candidate) -> bool:
     """Return whether the plant or a simpler entry at the same place already contains this physics."""
     if c.effect.where == "bending_pair":
         return any(_free_member(c, side) for side in ("TA", "TB"))
-    displaced = PLACES["displacement"](c.rig)
+    displaced = displacements(c.rig)
     return (
         c.effect.where != "displacement"
         and "tau" in c.effect.shapes
