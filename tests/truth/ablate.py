@@ -178,11 +178,6 @@ RULES: Mapping[str, Rule] = {
         {"law.contest._leading": lambda s, size: s.best},
         searches=True,
     ),
-    "surplus": Rule(
-        "an extension with an insignificant part is kept from 5 nats over the others",
-        {"search.beam.SURPLUS": float("inf")},
-        searches=True,
-    ),
     "near": Rule(
         "4.6 nats below a best that leaves only noise nothing is refitted or extended",
         {"search.beam.NEAR": float("inf")},

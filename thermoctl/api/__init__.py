@@ -20,7 +20,7 @@ from thermoctl.api.results import Simulation, joined
 from thermoctl.checks import Finding, checks
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import from_plain, load
-from thermoctl.plant.fitting.refit import fit
+from thermoctl.plant.fitting.refit import fit_by_first_parts
 from thermoctl.plant.simulation.initial import last_state, with_start
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
@@ -104,7 +104,7 @@ def refit(plant: Plant | str | Path, data: Data | Sequence[Data], tries: int = 0
     model = compile_plant(own.description)
     excitations = [model.excitation(t) for t in tables_of(own.description, data)]
     try:
-        return Refit(own, fit(model, excitations, tries=tries), tuple(excitations))
+        return Refit(own, fit_by_first_parts(model, excitations, tries=tries), tuple(excitations))
     except SimulationError as e:
         raise InputError(f"{own.description.file}: {e}") from None
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
-from thermoctl.diagnosis.data.pieces import in_pieces
+from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
 from thermoctl.diagnosis.evidence.between import between
-from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted, with_residuals
+from thermoctl.diagnosis.evidence.fit import Fitted, closest, with_residuals
 from thermoctl.diagnosis.evidence.held_out import split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
@@ -82,7 +82,8 @@ def sought(
 ) -> Sought:
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
-    (chosen_on, notes), (reserve, _) = (in_pieces(plant, part) for part in split(tables, held_out))
+    (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in split(tables, held_out))
+    plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
@@ -108,7 +109,7 @@ def decided(sought: Sought) -> Diagnosis:
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     chosen, posterior, asked = _chosen(sought, tried, physics)
-    null = with_residuals(known, as_refitted(known, tried[frozenset()].fitted))
+    null = with_residuals(known, closest(known, tried[frozenset()].fitted))
     best = with_residuals(known, tried[chosen].fitted) if chosen else null
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)

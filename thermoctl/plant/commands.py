@@ -18,7 +18,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant import show as drawing
 from thermoctl.plant.fitting.estimate import Estimate, report, starts, updated
 from thermoctl.plant.fitting.noise import coloured
-from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.fitting.refit import Fit, fit, fit_by_first_parts
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.plant.simulation.ahead import ahead, all_uncertain
 from thermoctl.plant.simulation.initial import last_state, with_start
@@ -214,7 +214,7 @@ def refit(args: argparse.Namespace, read: Reader | None = None) -> int:
     excitations = [model.excitation(t) for t in trained]
     held = (read or _read)(plant, args.held_out or [], args)
     try:
-        found = fit(model, excitations, tries=args.tries)
+        found = fit_by_first_parts(model, excitations, tries=args.tries)
         if args.noise == "ar1":
             found = fit(model, excitations, coloured(found, excitations), start=found.z)
         for d in excitations:

@@ -21,7 +21,7 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back, reuse_memory
-from thermoctl.plant.fitting.refit import Fit, fit
+from thermoctl.plant.fitting.refit import Fit, fit_by_first_parts
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
@@ -190,7 +190,7 @@ def case(
     rtol = _rtol(drives, noise)
     for d in drives:
         d.rtol = rtol
-    null = fit(model, drives, noise, fewer.z, tolerance=ROUGH, seconds=np.inf)
+    null = fit_by_first_parts(model, drives, noise, fewer.z, tolerance=ROUGH, seconds=np.inf)
     as_stated = [
         d.y - model.run(d, values, np.zeros_like(dx0)).y
         for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)

@@ -10,12 +10,13 @@ output's most sensitive change by an initial state, over the noise:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from thermoctl.plant.fitting.whitening import default_noise
 from thermoctl.plant.language import Plant
-from thermoctl.plant.parts import FEW, part, unread_starts
+from thermoctl.plant.parts import FEW, direct_outputs, part, unread_starts
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
@@ -42,6 +43,24 @@ def in_pieces(plant: Plant, tables: Sequence[Table]) -> tuple[list[Table], list[
                 f"{len(pieces)} recordings, each with a start of its own"
             )
     return out, notes
+
+
+def with_free_starts(plant: Plant, tables: Sequence[Table]) -> Plant:
+    """Return a plant whose unread states may start anywhere in their range over its runs.
+
+    What the plant file states of such a start holds for a recording, not for its pieces. Where the plant
+    cannot be simulated, it is returned as it is."""
+    model, read = compile_plant(plant), direct_outputs(plant)
+    loose = [n for n in model.uncertain if n not in read]
+    try:
+        runs = [model.run(model.prepare(model.excitation(t))).x for t in tables] if loose else []
+    except SimulationError:
+        return plant
+    nodes = dict(plant.nodes)
+    for n in loose:
+        spread = float(np.nanstd(np.concatenate(runs)[:, model.states.index(n)]))
+        nodes[n] = replace(nodes[n], initial_sigma=max(nodes[n].initial_sigma or 0.0, spread))
+    return replace(plant, nodes=nodes)
 
 
 def _pieces(model: Model, table: Table, d: Excitation, sigma: np.ndarray) -> tuple[list[Table], float]:

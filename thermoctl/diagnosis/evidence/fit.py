@@ -328,6 +328,17 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
     return dataclasses.replace(f, plant=f.rough_plant, fit=f.rough, powers=f.rough_powers, average=average)
 
 
+def closest(case: Case, f: Fitted) -> Fitted:
+    """Return the hypothesis at that of its two refits whose free run is closest to the data."""
+
+    def far(of: Fitted) -> float:
+        """Return the sum over outputs of the mean squares of errors over the noise."""
+        rms = of.fit.rms()
+        return sum((rms[o] / n.sigma) ** 2 for o, n in zip(rms, case.noise, strict=True) if rms[o] >= 0)
+
+    return min((as_refitted(case, f), f), key=far)
+
+
 def with_residuals(case: Case, f: Fitted) -> Fitted:
     """Return the fitted hypothesis with its residuals, simulated again if they were too many to keep."""
     if f.fit.residuals:

@@ -40,7 +40,7 @@ from thermoctl.plant.simulation.simulate import Excitation, SimulationError, com
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
-SURPLUS = 5.0  # nats by which an extension with an insignificant part must be above all others to be kept
+SURPLUS = 5.0  # nats by which an effect of no size must lead, so that the others are refitted without it
 # If the residual of the best is only noise, a hypothesis so many nats below is not refitted nor extended.
 # It has a hundredth of the probability.
 NEAR = 4.6
@@ -271,9 +271,9 @@ def cleared(s: Search) -> list[Weighed]:
     for e in best.fitted.hypothesis.effects:
         rest = tuple(o for o in best.fitted.hypothesis.effects if o is not e)
         known = s.tried.get(frozenset(o.key for o in rest))
-        if not rest or not known or known.score > best.score - SURPLUS or s.case.budget.stopped():
+        if not known or known.score > best.score - SURPLUS or s.case.budget.stopped():
             continue
-        if near_nothing(best.fitted, e) and (w := rebuilt(s, rest, values, best.fitted)):
+        if near_nothing(best.fitted, e) and (w := rebuilt(s, rest, values, best.fitted, near=best.fitted)):
             found.append(w)
     return found
 
@@ -284,11 +284,13 @@ def rebuilt(
     values: Fitted,
     leader: Fitted | None,
     instead: Mapping[Key, Effect] | None = None,
+    near: Fitted | None = None,
 ) -> Weighed | None:
     """Refit the case's plant with some effects of a hypothesis, from its values; None where this fails.
 
     It fails for a law: the catalogue has no place for it. `instead`: by effect, a simpler one that takes its
-    place."""
+    place. `near`: a hypothesis that has the effects, too: where the refit is less likely, it starts again
+    from all unknowns of that one."""
     case, known, instead = s.case, values.rough_plant, instead or {}
     if any(e.key[0] not in case.catalogue for e in effects):
         return None
@@ -299,7 +301,7 @@ def rebuilt(
         _simpler(b, e.candidate.effect, instead[e.key]) if e.key in instead else b
         for e, b in zip(effects, placed_before(effects, known), strict=True)
     ]
-    return remade(s, before, plant, entries, leader)
+    return remade(s, before, plant, entries, leader, near)
 
 
 def _simpler(before: PlacedBefore, richer: Effect, simple: Effect) -> PlacedBefore:
@@ -323,6 +325,7 @@ def remade(
     plant: Plant,
     entries: Mapping[str, Effect],
     leader: Fitted | None,
+    near: Fitted | None = None,
 ) -> Weighed | None:
     """Refit a plant with effects of an earlier hypothesis, from their values; None where this fails.
 
@@ -335,7 +338,7 @@ def remade(
             plant, before = c.extend(e.values, e.ranges), plant
             drives = case.drives_after(plant, before, drives)
             placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
-        return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader))
+        return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader, near))
     except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
         return None
 
@@ -414,7 +417,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     leader. Every prediction is multiplied by the largest ratio so far of a refit's gain to its prediction."""
     case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
-    doubtful: list[Weighed] = []
     quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
@@ -450,14 +452,13 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
             gained = s.weighed(f).score - parent.score if f else -np.inf
             ratio = max(ratio, gained / max(gain, 1.0)) if np.isfinite(gain) else ratio
             s.refuse(parent.fitted.hypothesis.keys | {d.candidate.key for d in added}, f)
-            if f and not f.absent:
-                (doubtful if f.doubtful else out).append(s.weighed(f))
-            if f and (f.absent or f.doubtful):
+            if f and not (f.absent or f.doubtful):
+                out.append(s.weighed(f))
+            elif f:
                 queued = {d.candidate.key for ds, _ in queue for d in ds}
                 more = simpler(added, gain, looked, where, limits)
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
-    simplest = max((w.score for w in (parent, *out)), default=parent.score)
-    return [*out, *(w for w in doubtful if w.score > simplest + SURPLUS)]
+    return out
 
 
 def _rival(added: Sequence[Direction], leading: Keys) -> bool:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.climb import Climbed, Spot, climb
 from thermoctl.plant.fitting.residuals import Evaluation, Prior, Problem, ResidualRows
 from thermoctl.plant.fitting.whitening import Noise, default_noise
@@ -23,6 +24,10 @@ KEPT_STARTS = 2  # number of random starts that are refined
 PREVIEW = 12  # iterations of a further start before its cost is compared with PREVIEW_SHARE of the best
 PREVIEW_SHARE = 0.98
 RELIMITS = 4  # largest number of times that the outlier limits are updated
+FIRST_PARTS = (0.25, 0.5)  # shares of each recording that are fitted one after the other
+SHORTEST = 8  # least number of rows of a first part
+MISFIT = 2.0  # ratio of a residual to its noise, above which a fit is tried by first parts, too
+LESS = 0.9  # largest cost of that fit, over the first one's, with which it counts
 
 
 @dataclass
@@ -131,6 +136,34 @@ def fit(
     if best is None:
         raise failure or SimulationError("the plant cannot be simulated")
     return best
+
+
+def fit_by_first_parts(
+    model: Model,
+    excitations: Sequence[Excitation],
+    noise: Sequence[Noise] | None = None,
+    start: Mapping[str, float] | np.ndarray | None = None,
+    tolerance: float = 1e-4,
+    tries: int = 0,
+    seconds: float = 600.0,
+) -> Fit:
+    """Fit as `fit` does; where a misfit stays, a second time from fits of the recordings' first parts.
+
+    A rig that oscillates has a wrong optimum for each period that a free run gains or loses. A first
+    part is too short for that. Raises as `fit` does."""
+    first = fit(model, excitations, noise, start, tolerance=tolerance, tries=tries, seconds=seconds)
+    over = [first.rms()[o] / n.sigma for o, n in zip(model.outputs, first.noise, strict=True)]
+    if not any(ratio > MISFIT for ratio in over):  # an output that was not measured has NaN
+        return first
+    try:
+        z = start
+        for share in FIRST_PARTS:
+            some = [d.part(0, max(int(share * len(d.t)), SHORTEST)) for d in excitations]
+            z = fit(model, some, noise, z, tolerance=tolerance, seconds=seconds).z
+        second = fit(model, excitations, noise, z, tolerance=tolerance, seconds=seconds)
+    except (SimulationError, InputError):  # a first part may hold no reading at all
+        return first
+    return second if second.cost < LESS * first.cost else first
 
 
 def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> list[np.ndarray]:
