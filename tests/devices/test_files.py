@@ -6,7 +6,9 @@ import pytest
 
 from tests.devices.harness import HEAD, make
 from thermoctl.files.yamlfile import InputError
-from thermoctl_hal.base.backend import ERROR, OK, ROLE, Sample
+from thermoctl_hal.base.backend import ABSENT, ERROR, OK, ROLE, STALE, Sample
+from thermoctl_hal.base.message import can_frame
+from thermoctl_hal.base.profile import CanMessage
 from thermoctl_hal.base.units import dbc_unit
 from thermoctl_hal.can.bus import BY_PGN, EXTENDED, is_wanted, pgn_of
 from thermoctl_hal.can.dbc_file import load_dbc
@@ -506,7 +508,10 @@ NESTED = (
 PAGES = "SG_MUL_VAL_ 801 Sub Page 1-1;\nSG_MUL_VAL_ 801 Volts Sub 3-3;\n"
 
 
-@pytest.mark.parametrize("text", [NESTED, NESTED.replace("m1M", "").replace(" M ", " ")])
+@pytest.mark.parametrize(
+    "text",
+    [NESTED, NESTED.replace("m1M", "").replace(" M ", " "), NESTED + "SG_MUL_VAL_ 801 Volts Sub 3-3;\n"],
+)
 def test_a_page_that_nothing_selects_is_refused(tmp_path, text):
     """The signal was read from the frames of every page."""
     with pytest.raises(InputError, match="select its page: add SG_MUL_VAL_"):
@@ -528,3 +533,88 @@ def test_a_number_that_the_file_names_as_no_value_is_none(tmp_path, fault):
     dev = device(tmp_path, (START + fault + GOOD + words).encode("cp1252"), [T], "{t: air_c}")
     for raw, status in ((255, ERROR), (60, OK)):
         assert read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]] == status
+
+
+def test_a_page_is_selected_by_the_raw_number_of_its_multiplexer(tmp_path):
+    """By a multiplexer with a factor the value of another page was read, and another page was sent."""
+    pages = NESTED.replace("m1M : 8|8@1+ (1,0)", "M : 8|8@1+ (2,1)").replace(" Page M ", " Page ")
+    dev = device(tmp_path, START + pages, [V], "{v: voltage_v}")
+    for raw, status in ((3, OK), (1, ABSENT)):
+        frame = bytes([0, raw, 0xD2, 4, 0, 0, 0, 0])
+        assert read(dev, (801, frame)).status[ROLE["voltage_v"]] == status
+    message = CanMessage("READING", {"Sub": 7.0, "Volts": None})
+    assert can_frame(message, dev.binding.profile.bus_spec, 12.34, 0) == (
+        801,
+        bytes([0, 3, 0xD2, 4, 0, 0, 0, 0]),
+    )
+
+
+STATUS = ' SG_ Good : 56|8@1+ (1,0) [0|0] "" HOST\n'
+SEEN = {
+    "a short frame": (GOOD.rstrip("\n") + "\n" + STATUS, [bytes(4), bytes(7)]),
+    "another page": (
+        GOOD.replace(" Volts :", " Volts m1 :").rstrip("\n")
+        + '\n SG_ Page M : 48|8@1+ (1,0) [0|0] "" HOST\n'
+        + STATUS.replace(" :", " m0 :"),
+        [bytes([0, 0, 0, 0, 0, 0, page, 0]) for page in (0, 1)],
+    ),
+}
+
+
+@pytest.mark.parametrize("how", SEEN)
+def test_a_reading_whose_status_does_not_come_is_none(tmp_path, how):
+    text, frames = SEEN[how]
+    dev = device(tmp_path, START + text + "\n", [V + ", invalid: {signal: Good, good: 0}"], "{v: voltage_v}")
+    sample = read(dev, *((801, frame) for frame in frames))
+    assert sample.status[ROLE["voltage_v"]] == ABSENT
+    sample.status[ROLE["voltage_v"]] = STALE
+    assert "READING came without Good, which says" in dev.explain(sample, ROLE["voltage_v"])
+
+
+def test_a_status_or_sentinel_of_a_float(tmp_path):
+    """A status of NaN ended the loop; a sentinel of 16 bits ended `check`."""
+    floats = GOOD.rstrip("\n") + "\n" + STATUS.replace("56|8", "32|16") + "\nSIG_VALTYPE_ 801 Good : 1;\n"
+    with pytest.raises(InputError, match="signal: Good is a float"):
+        device(tmp_path, START + floats, [V + ", invalid: {signal: Good, good: 0}"], "{v: voltage_v}")
+    channel = V.replace("Volts", "Good") + ", sentinels: ['0x7B00']"
+    dev = device(tmp_path, START + floats, [channel], "{v: voltage_v}")
+    for raw, status in ((0x7B, ERROR), (0x3C, OK)):
+        assert read(dev, (801, bytes([0, 0, 0, 0, 0, raw]))).status[ROLE["voltage_v"]] == status
+
+
+COMMAND = """
+bus: can-dbc
+dbc: a.dbc
+drive:
+  {unit: A, scale: 1, limits: [-2, 2], watchdog_s: none, state: assumed, disable: [{message: STOP}],
+   command: {message: COMMAND, values: {%s: command}}}
+channels: {v: {message: READING, signal: Volts, unit: V, rate_hz: 20, stale_after_s: 1}}
+"""
+SENT = {
+    "overlapping": (
+        ' SG_ Amps : 0|16@1- (0.001,0) [0|0] "A" H\n SG_ B : 8|8@1- (1,0) [0|0] "" H\n',
+        "overlap",
+    ),
+    "a page without signals": (
+        ' SG_ Amps : 0|16@1- (0.001,0) [0|0] "A" H\n SG_ P M : 16|8@1+ (1,0) [0|0] "" H\n SG_ B m2 : 24|8@1- (1,0) [0|0] "" H\n',
+        'multiplexer "P" but got 0',
+    ),
+    "pages that select themselves": (
+        ' SG_ P M : 0|8@1+ (1,0) [0|0] "" H\n SG_ Q m1M : 8|8@1+ (1,0) [0|0] "" H\n SG_ Amps m2 : 16|16@1- (0.001,0) [0|0] "A" H\n\n'
+        "SG_MUL_VAL_ 802 Q Q 1-1;\nSG_MUL_VAL_ 802 Amps Q 2-2;\n",
+        "Q selects its own page",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", SENT)
+def test_a_command_that_cannot_be_encoded_is_refused(tmp_path, how):
+    """It ended the loop while it drove, or kept the messages that switch the amplifier off from being sent."""
+    signals, words = SENT[how]
+    stop = 'BO_ 803 STOP: 1 H\n SG_ Off : 0|8@1+ (1,0) [0|0] "" D\n\n'
+    tmp_path.joinpath("a.dbc").write_text(
+        START + GOOD.replace("°", "") + stop + "BO_ 802 COMMAND: 8 H\n" + signals
+    )
+    with pytest.raises(InputError, match=words) as e:
+        make(tmp_path, HEAD + COMMAND % "Amps", "virtual:x", "{state: amplifier_state, v: voltage_v}")
+    assert re.match(r".*device\.yaml:\d+:\d+: (command|message): ", str(e.value))

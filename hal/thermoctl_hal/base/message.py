@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from thermoctl_hal.base.key import whole_range
 from thermoctl_hal.base.profile import (
@@ -19,6 +20,9 @@ from thermoctl_hal.base.profile import (
     typed,
 )
 from thermoctl_hal.base.wire import Framer
+
+if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can.signal import Signal
 
 _ADDRESS = re.compile(rb"\{address(:[^{}]*)?\}")
 _COMMAND = re.compile(rb"\{command(:[^{}]*)?\}")
@@ -54,13 +58,21 @@ def can_frame(message: Message, spec: Dbc, command: float, address: int) -> tupl
     if not isinstance(message, CanMessage):
         raise TypeError(f"{type(message).__name__} is no CAN message")
     definition = spec.database.get_message_by_name(message.name)
-    values = _values(message, (s.name for s in definition.signals), command)
-    return spec.can_id(message.name, address), bytes(definition.encode(values, strict=False))
+    given = _values(message, definition.signals, command)
+    # Raw numbers, because cantools selects a page by the number that it is given.
+    raws = {s.name: _raw(s, given[s.name]) for s in definition.signals}
+    return spec.can_id(message.name, address), bytes(definition.encode(raws, scaling=False, strict=False))
 
 
-def _values(message: CanMessage, signals: Iterable[str], command: float) -> dict[str, float]:
+def _values(message: CanMessage, signals: Iterable[Signal], command: float) -> dict[str, float]:
     given = {name: command if value is None else value for name, value in message.values.items()}
-    return dict.fromkeys(signals, 0.0) | given
+    return {s.name: 0.0 for s in signals} | given
+
+
+def _raw(signal: Signal, value: float) -> float:
+    """Return the number that a signal carries; a signal without a factor cannot be sent."""
+    exact = (value - signal.offset) / signal.scale if signal.scale else 0.0
+    return exact if signal.is_float else round(exact)
 
 
 def clipped(value: float, register: Register) -> float:
@@ -91,17 +103,14 @@ def misfit(message: Message, spec: BusSpec, command: float) -> str:
 
 
 def _misfit_of_signals(message: CanMessage, spec: Dbc, command: float) -> str:
-    signals = {s.name: s for s in spec.database.get_message_by_name(message.name).signals}
-    values = _values(message, signals, command)
-
-    def raw(name: str) -> float:
-        """Return the number that the signal carries."""
-        return float((values[name] - signals[name].offset) / signals[name].scale)
+    definition = spec.database.get_message_by_name(message.name)
+    signals = {s.name: s for s in definition.signals}
+    values = _values(message, definition.signals, command)
 
     def is_sent(name: str) -> bool:
         """Return whether the frame's page holds the signal."""
         ids, by = signals[name].multiplexer_ids, signals[name].multiplexer_signal
-        return not ids or by is None or (is_sent(by) and round(raw(by)) in ids)
+        return not ids or by is None or (is_sent(by) and _raw(signals[by], values[by]) in ids)
 
     for name, s in signals.items():
         if not is_sent(name):
@@ -111,9 +120,16 @@ def _misfit_of_signals(message: CanMessage, spec: Dbc, command: float) -> str:
         if not s.scale:
             return f"{name} has the factor 0 in the DBC file"
         low, high = whole_range(s.length, s.is_signed)
-        if not s.is_float and not low - 0.5 <= raw(name) <= high + 0.5:
+        if not s.is_float and not low <= _raw(s, values[name]) <= high:
             first, last = sorted(x * s.scale + s.offset for x in (low, high))
             return f"{name} cannot be {values[name]:g}: it holds {first:g} .. {last:g}" + (
                 "" if name in message.values else "; give its value in 'values'"
             )
+    try:
+        sent: Any = definition.decode_simple(can_frame(message, spec, command, 0)[1], False, False)
+    except Exception as e:  # the DBC file decides what is raised: overlapping signals, a page without any
+        return f"{message.name} cannot be sent ({e}): its signals must not overlap, its page must have one"
+    for name in message.values:
+        if not signals[name].is_float and sent[name] != _raw(signals[name], values[name]):
+            return f"{name} cannot be sent: another signal of {message.name} has some of its bits"
     return ""

@@ -17,6 +17,7 @@ from thermoctl_hal.base.message import can_frame
 from thermoctl_hal.base.profile import Amplifier, Assumed, CanMessage, Dbc, DbcSource, Message, typed
 from thermoctl_hal.base.wire import EXTENDED
 from thermoctl_hal.can.bus import BY_PGN, AnyPort, open_can, pgn_of
+from thermoctl_hal.can.dbc_file import multiplexers
 
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Message as DbcMessage
@@ -35,7 +36,7 @@ class DbcDevice(Device):
         self._port: AnyPort | None = None
         self._messages: dict[int, _Entry] = {}
         """CAN id, or parameter group of J1939 -> the message, its bound channels, and the names of signals
-        whose raw numbers say whether they are good."""
+        that say whether they are good."""
         self._sender: dict[int, int] = {}  # parameter group -> the source address that it is taken from
         self._fd_ignored = 0
         self._others: set[int] = set()  # source addresses of J1939 whose messages were not taken
@@ -66,8 +67,6 @@ class DbcDevice(Device):
             entry[1].append((i, source))
             if source.invalid is not None:
                 entry[2].append(source.invalid.field)
-            if source.sentinels or source.absent:
-                entry[2].append(source.signal)
 
     def connect(self) -> None:
         """Open the port."""
@@ -128,33 +127,47 @@ class DbcDevice(Device):
                     f"say address: {can_id & 0xFF}"
                 )
             return
+        message, sources, tests = entry
         try:
-            needed = (*(s.signal for _, s in entry[1]), *entry[2])
-            values = _decoded(entry[0], data, True, needed)
-            readings = [(i, s, float(values[s.signal])) for i, s in entry[1] if s.signal in values]
-            raws = _decoded(entry[0], data, False, needed) if entry[2] else {}
+            raws = _decoded(message, data, (*(s.signal for _, s in sources), *tests))
         except Exception as e:  # foreign bytes may raise anything in the library
             self.counts["errors"] += 1
             self._quiet += 1
-            self._why = f"{entry[0].name} came with {len(data)} bytes and does not decode ({e})"
+            self._why = f"{message.name} came with {len(data)} bytes and does not decode ({e})"
             return
+        readings = [(i, s) for i, s in sources if s.signal in raws]
         if not readings:
-            self._without_signal(entry[0], data, values)
+            self._without_signal(message, data, raws)
             return
         self.counts["frames"] += 1
-        for i, source, value in readings:
-            self._quiet, self._why = 0, ""
-            test = source.invalid
-            if (raw := raws.get(source.signal)) in source.sentinels or raw in source.absent:
-                self.fail(sample, i, f"{source.signal} is {value:g}: no reading")
-            elif test is not None and int(raws.get(test.field, test.value)) & test.mask != test.value:
-                self.fail(
-                    sample, i, f"{test.field} is 0x{int(raws[test.field]):X}: the device reports a fault"
-                )
-            else:
-                self.put(sample, i, value, now_s)
+        self._quiet, self._why = 0, ""
+        for i, source in readings:
+            self._store(sample, i, message, source, raws, now_s)
 
-    def _without_signal(self, message: DbcMessage, data: bytes, values: Mapping[str, Any]) -> None:
+    def _store(
+        self,
+        sample: Sample,
+        i: int,
+        message: DbcMessage,
+        source: DbcSource,
+        raws: Mapping[str, float],
+        now_s: float,
+    ) -> None:
+        """Store one reading of a frame, unless the frame says that it is none."""
+        signal, raw, test = message.get_signal_by_name(source.signal), raws[source.signal], source.invalid
+        value = float(raw * signal.scale + signal.offset)
+        if raw in source.sentinels or raw in source.absent:
+            self.fail(sample, i, f"{source.signal} is {value:g}: no reading")
+        elif test is None:
+            self.put(sample, i, value, now_s)
+        elif test.field not in raws:
+            self.miss(i, f"{message.name} came without {test.field}, which says whether it is good")
+        elif int(raws[test.field]) & test.mask != test.value:
+            self.fail(sample, i, f"{test.field} is 0x{int(raws[test.field]):X}: the device reports a fault")
+        else:
+            self.put(sample, i, value, now_s)
+
+    def _without_signal(self, message: DbcMessage, data: bytes, raws: Mapping[str, float]) -> None:
         """Note a frame without any signal of the profile: it is short, or of another page."""
         self._quiet += 1
         if len(data) < message.length:
@@ -162,7 +175,7 @@ class DbcDevice(Device):
             self._why = f"{message.name} came with {len(data)} of {message.length} bytes, without the signal"
             return
         self.counts["frames"] += 1
-        pages = ", ".join(f"{s.name} {values.get(s.name)}" for s in message.signals if s.is_multiplexer)
+        pages = ", ".join(f"{s.name} {raws.get(s.name)}" for s in message.signals if s.is_multiplexer)
         self._why = f"{message.name} came with {pages}, a page without the signal"
 
     def silence(self) -> str:
@@ -182,31 +195,27 @@ class DbcDevice(Device):
         return self.counts
 
 
-def _decoded(
-    message: DbcMessage, data: bytes, scaling: bool, wanted: Iterable[str] = ()
-) -> Mapping[str, Any]:
-    """Return the signals of a frame.
+def _decoded(message: DbcMessage, data: bytes, wanted: Iterable[str]) -> Mapping[str, float]:
+    """Return the raw numbers of a frame's signals.
 
-    Of a page that the file does not describe, those of every page and the wanted ones."""
+    cantools selects a page by the number that it returns for the multiplexer, and pages are counted in raw
+    numbers. Of a page that the file does not describe, those of every page and the wanted ones."""
     try:
-        found: Any = message.decode_simple(data, False, scaling, True)
+        found: Any = message.decode_simple(data, False, False, True)
     except Exception:  # foreign bytes may raise anything in the library
         if not message.is_multiplexed():
             raise
-        found = _alone(message, "").decode_simple(data, False, scaling, True)
+        found = _alone(message, "").decode_simple(data, False, False, True)
         for name in wanted:
             with suppress(Exception):  # it is on another page
-                found |= _alone(message, name).decode_simple(data, False, scaling, True)
-    return cast(Mapping[str, Any], found)
+                found |= _alone(message, name).decode_simple(data, False, False, True)
+    return cast(Mapping[str, float], found)
 
 
 @lru_cache(maxsize=256)
 def _alone(message: DbcMessage, name: str) -> DbcMessage:
     """Return a multiplexed message with the signals of every page, and one with its multiplexers."""
-    by_name, chain = {s.name: s for s in message.signals}, set()
-    while name in by_name:
-        chain.add(name)
-        name = by_name[name].multiplexer_signal or ""
+    chain = {name, *multiplexers(message, name)}
     signals = [s for s in message.signals if not s.multiplexer_ids or s.name in chain]
     return type(message)(message.frame_id, message.name, message.length, signals, strict=False)
 

@@ -111,7 +111,7 @@ def _misread(text: str, database: Database) -> dict[str, str]:
     """Return the signals whose kind or page cantools passes over, and why.
 
     It does so at the end of a file that was cut off. Where several multiplexers, or none, could select a
-    page, it takes the signal from every page."""
+    page, it takes the signal from every page. The signals on pages of such a multiplexer are left out, too."""
     faults: dict[str, str] = {}
     for block in _blocks(text, faults)[0]:
         for line, signal in block.lines[1:]:
@@ -122,7 +122,23 @@ def _misread(text: str, database: Database) -> dict[str, str]:
     read = {
         f"{m.name}.{s.name}" for m in database.messages for s in m.signals if s.is_float or s.multiplexer_ids
     }
-    return {name: why for name, why in faults.items() if name not in read}
+    unread = {name: why for name, why in faults.items() if name not in read}
+    for m in database.messages:
+        for s in m.signals:
+            chain = list(multiplexers(m, s.name))
+            unread |= {f"{m.name}.{s.name}": unread[n] for by in chain if (n := f"{m.name}.{by}") in unread}
+            if s.name in chain:
+                unread[m.name] = f"{s.name} selects its own page: correct its SG_MUL_VAL_ line"
+    return unread
+
+
+def multiplexers(message: Message, name: str) -> Iterator[str]:
+    """Yield the multiplexer that selects the page of a signal, then the one that selects its own, and so on."""
+    by_name = {s.name: s.multiplexer_signal for s in message.signals}
+    for _ in by_name:  # a faulty file may let two of them select each other
+        if not (name := by_name.get(name) or ""):
+            return
+        yield name
 
 
 def _first_line(error: Exception) -> str:

@@ -61,6 +61,10 @@ def read_signal(s: Section, spec: BusSpec) -> DbcSource:
     if k["invalid"] is not None:
         i = take(k["invalid"], CAN["invalid of can-dbc"])
         test = _signal_of(k["invalid"], dbc, message)
+        if test.is_float:
+            raise (
+                k["invalid"].get("signal").error(f"signal: {test.name} is a float, which has no bits to test")
+            )
         invalid = Condition(test.name, i["mask"] or -1, i["good"])
         k["invalid"].end()
     signal = _signal_of(s, dbc, message)
@@ -117,7 +121,7 @@ def _raw_sentinel(node: Node, signal: Signal) -> float:
     Raises InputError where the signal can hold neither."""
     value = number_of(node, "sentinels")
     if isinstance(node.value, str):  # hexadecimal: the bits of the raw number
-        letter = {32: "f", 64: "d"}[signal.length] if signal.is_float else ""
+        letter = {16: "e", 32: "f", 64: "d"}[signal.length] if signal.is_float else ""
         return sentinel_of(node, signal.length, signal.is_signed, letter)
     if signal.is_float:
         return float((value - signal.offset) / signal.scale)
