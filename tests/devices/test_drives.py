@@ -426,6 +426,39 @@ def test_mistakes_in_a_drive_are_told(tmp_path, old, new, message):
         load_profile(tmp_path / "p.yaml")
 
 
+def test_the_echo_of_a_command_is_no_reading(tmp_path):
+    """An amplifier that was dead behind its echo had the current that was asked for."""
+    alive, rest, commands, read = [False], [b""], [], set()
+
+    def take(data):
+        *found, rest[0] = (rest[0] + data).split(b"\r")
+        commands.extend(found)
+        return b"".join(m + (b"\rI=0.250\r" if m == b"I?" and alive[0] else b"\r") for m in found)
+
+    wire = Port(take, tmp_path / "wire")
+    (tmp_path / "amplifier.yaml").write_text(
+        f"{HEAD}bus: serial-lines\ntext: {{pattern: 'I=(?P<i>[-+.0-9]+)$', request: 'I?\\r', request_hz: 100}}\n"
+        "drive: {unit: A, scale: 1, limits: [-2, 2], watchdog_s: none, state: assumed, command: 'I={command:.3f}\\r', "
+        "disable: ['OUT 0\\r'], enable: ['OUT 1\\r']}\n"
+        "channels: {current: {field: i, unit: A, range: [-3, 3], rate_hz: 100, stale_after_s: 0.5}}\n"
+    )
+    text = f"- {{name: amplifier, profile: amplifier.yaml, port: {tmp_path}/wire, roles: {{state: amplifier_state, current: current_a}}}}"
+    with Rig(tmp_path, text) as rig:
+
+        def current():
+            read.add(rig.value("current_a")) if rig.status("current_a") == "OK" else None
+            return commands.count(b"I=1.500") > 20
+
+        rig.drive, rig.enable = 1.5, True
+        rig.until(current)
+        assert not read and "our own message" in rig.devices[0].silence()
+        alive[0] = True
+        commands.clear()
+        rig.until(lambda: current() and read)
+        assert read == {0.25}
+    wire.close()
+
+
 class Positioner:
     """A CiA-402 drive in cyclic position mode behind a Lawicel adapter: SDO, PDO by SYNC, heartbeat.
 

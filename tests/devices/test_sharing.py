@@ -157,8 +157,11 @@ def test_text_devices_that_are_asked_share_a_line(tmp_path):
     wire.close()
 
 
-def test_a_late_answer_is_not_taken_for_another_device(tmp_path):
-    """A gauge that is always later than `answer_s` gives no reading, and its neighbours keep theirs."""
+@pytest.mark.parametrize("echoes", [False, True])
+def test_a_late_answer_is_not_taken_for_another_device(tmp_path, echoes):
+    """A gauge that is always later than `answer_s` gives no reading, and its neighbours keep theirs.
+
+    The echo of an RS-485 adapter is no answer either: it ended a gauge's turn before the answer came."""
     takes_s, wrong = {1: 0.3, 2: 0.15}, []  # answer_s is 0.2 s
 
     def send(answer):
@@ -166,7 +169,7 @@ def test_a_late_answer_is_not_taken_for_another_device(tmp_path):
             os.write(wire.fds[0], answer)
 
     def take(data):
-        out = b""
+        out = data if echoes else b""
         for request in data.split(b"\r")[:-1]:
             number = int(request[1:])
             answer = b"%+08.1f\r" % (100.0 * number)

@@ -20,6 +20,7 @@ class SerialDrive(Commanded, SerialDevice):
         data = serial_bytes(message, command, self.binding.address)
         if self._fd < 0:
             raise HardwareError("not connected")
+        self.sent(data)
         try:
             written = os.write(self._fd, data)
         except BlockingIOError:

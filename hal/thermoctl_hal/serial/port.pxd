@@ -4,13 +4,13 @@ from thermoctl_hal.base.device cimport Device
 from thermoctl_hal.base.wire cimport Framer
 
 cdef class SerialDevice(Device):
-    cdef public object _port, _line, _lines, _text, _fields
+    cdef public object _port, _line, _lines, _text, _fields, _sent
     cdef public str _why
     cdef public bytes _request
     cdef public int _fd, _flags, _unread
     cdef public unsigned long long _flag_mask, _flag_good
     cdef public double _request_hz, answer_s
-    cdef public bint _waited
+    cdef public bint _waited, _echoes
     cdef public Framer _framer
     cdef public double _due_s
     cdef public int[::1] _index

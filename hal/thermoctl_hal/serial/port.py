@@ -3,6 +3,11 @@
 
 line.py opens the port, wire.Framer finds the frames in the bytes. Several devices that answer
 requests may share a line (RS-485): shared_line.py opens it once and asks one of them at a time.
+
+A line may send our own messages back: an RS-485 adapter, or a device with its echo on. A command that the
+pattern takes would then be read as a measured current, or as the state of an amplifier that is dead. A line
+echoes if a message comes back that no answer can be, because the pattern does not take it. From then on each
+line equal to one that was sent is passed over, once.
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ import contextlib
 import os
 import re
 from array import array
+from collections import deque
 from typing import Any
 
 from thermoctl_hal.base.backend import Sample
@@ -22,6 +28,8 @@ from thermoctl_hal.base.profile import Assumed, BinaryFrame, TextField, TextLine
 from thermoctl_hal.base.wire import Framer, checksum, read_available, wait_readable
 from thermoctl_hal.serial.shared_line import SharedLine, join, leave
 from thermoctl_hal.serial.text_number import cut_short, number, shown, why_no_match, why_no_number
+
+ECHOES = 64  # lines of ours that may still come back
 
 
 class SerialDevice(Device):
@@ -35,6 +43,8 @@ class SerialDevice(Device):
         spec = binding.profile.bus_spec
         self._framer: Framer | None = None
         self._due_s, self._waited = 0.0, False
+        self._sent: deque[str] = deque(maxlen=ECHOES)  # lines of ours that have not come back
+        self._echoes = False  # does the line send them back?
         self._unread, self._why = 0, ""  # lines since the last reading, and why the last of them gave none
         if isinstance(spec, BinaryFrame):
             self._framer = Framer(spec)
@@ -68,7 +78,8 @@ class SerialDevice(Device):
             self._port = open_port(port, line)
             self._fd = self._port.fileno()
         self._lines.reset()
-        self._waited, self._unread = False, 0
+        self._sent.clear()
+        self._waited, self._unread, self._echoes = False, 0, False
         if self._framer:
             self._framer.reset()
 
@@ -125,6 +136,11 @@ class SerialDevice(Device):
             self._lines.drop_half(1.0 / self._request_hz)
         with contextlib.suppress(BlockingIOError):  # the line is full: ask again at the next due time
             os.write(fd, self._request)
+        self.sent(self._request)
+
+    def sent(self, data: bytes) -> None:
+        """Note a message of ours, which may come back."""
+        self._sent.extend(data.decode("ascii", "replace").splitlines())
 
     def asked(self, now_s: float) -> None:
         """Note that a shared line has asked this device."""
@@ -185,6 +201,12 @@ class SerialDevice(Device):
     def _take_lines(self, sample: Sample, data: bytes, now_s: float) -> None:
         for raw in self._lines.feed(data) if data else ():
             line = raw.decode("ascii", "replace")
+            if self._is_echo(line):
+                self._unread, self._why = (
+                    self._unread + 1,
+                    f"received {shown(line)}, which is our own message",
+                )
+                continue
             problem = self._take_line(sample, line, now_s)
             if problem:
                 self.counts["errors"] += 1
@@ -192,6 +214,15 @@ class SerialDevice(Device):
             else:
                 self.counts["frames"] += 1
                 self._unread = 0
+
+    def _is_echo(self, line: str) -> bool:
+        """Return whether a line is one that we sent."""
+        if line not in self._sent:
+            return False
+        self._echoes = self._echoes or self._text.pattern.match(line) is None
+        if self._echoes:
+            self._sent.remove(line)
+        return self._echoes
 
     def _take_line(self, sample: Sample, line: str, now_s: float) -> str:
         """Store the readings of a line; return '', or the reason when it gave none.
