@@ -38,6 +38,7 @@ class Gauge:
         node = f"{{name: gauge, profile: gauge.yaml, port: {os.ttyname(slave)}, roles: {{position: position_um}}}}"
         self.device, self.sample = SerialDevice(bind(yamlfile.loads(node), folder)), Sample()
         self.device.connect()
+        os.write(self.master, b"\r\n")  # ends a line that began before
 
     def says(self, line):
         """Send a line; the reading that it gives, or None."""
@@ -173,3 +174,12 @@ def test_a_line_of_another_kind_leaves_the_other_reading_alone(gauge):
     g = gauge("(?:X=(?P<x>[-+.0-9]+)|T=(?P<t>[-+.0-9]+))$")
     assert g.says("X=1.5") == 1.5
     assert g.says("T=7") is None and g.device.counts["errors"] == 0
+
+
+def test_the_rest_of_a_line_from_before_is_no_reading(gauge):
+    """+0012.456 was read as 2.456 by a port that was opened in the middle of it."""
+    made = gauge("(?P<x>[-+0-9.]+)$")
+    made.device.disconnect()
+    made.device.connect()
+    os.write(made.master, b"2.456\r\n")
+    assert made.says("+0012.789") == 12.789 and made.device.counts["frames"] == 1

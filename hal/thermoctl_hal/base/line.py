@@ -49,24 +49,24 @@ class LineReader:
             lines, self._dropping = lines[1:], False
         if len(rest) > MAX_LINE:
             self.bad += not self._dropping
-            rest, self._dropping = b"", True
+            rest, self._dropping = rest[:MAX_LINE], True
         self._buffer[:] = rest
         return [line for line in lines if 0 < len(line) <= MAX_LINE]
 
     @property
     def pending(self) -> int:
         """Count the bytes of a line that has no end yet."""
-        return MAX_LINE if self._dropping else len(self._buffer)
+        return len(self._buffer)
 
     def drop_half(self, period_s: float) -> None:
         """Drop an incomplete line if its rest is lost: nothing came for most of `period_s`."""
         if time.monotonic() - self._heard_s > min(QUIET_S, 0.7 * period_s):
             self.reset()
 
-    def reset(self) -> None:
-        """Drop an incomplete line."""
+    def reset(self, is_amid: bool = False) -> None:
+        """Drop an incomplete line. is_amid: the next bytes may be the end of a line, which is dropped, too."""
         self._buffer.clear()
-        self._dropping = False
+        self._dropping = is_amid
 
 
 def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:

@@ -77,7 +77,7 @@ class SerialDevice(Device):
         else:
             self._port = open_port(port, line)
             self._fd = self._port.fileno()
-        self._lines.reset()
+        self._lines.reset(not self._request)
         self._sent.clear()
         self._waited, self._unread, self._echoes = False, 0, False
         if self._framer:
