@@ -521,3 +521,22 @@ def test_a_point_that_may_part_thousands_is_noted(tmp_path, rows, note):
     header = "Zeit;P;T\n" if rows.count(";") == 2 else "Zeit;P\n"
     path.write_text(header + "".join(rows.format(i=i) for i in range(6)))
     assert any(note in n for n in read_recording(path).notes)
+
+
+@pytest.mark.parametrize("title", ["", "Motor test;;\n"])
+@pytest.mark.parametrize("units", ["s;mA;degC", "[s];[mA];[degC]"])
+def test_units_above_the_names(tmp_path, title, units):
+    """They were left out, or were the names, and milliamperes were read as amperes."""
+    found = read(tmp_path, f"{title}{units}\ntime;I;T\n0;1;20\n1;2;21\n2;4;23\n")
+    assert found.t.tolist() == [0, 1, 2] and found.columns["I"].tolist() == [1, 2, 4]
+    assert found.units == {"I": "mA", "T": "degC"}
+
+
+def test_letters_of_channels_above_the_names_are_no_units(tmp_path):
+    found = read(tmp_path, "A;V;C\ntime;speed;flow\n0;1;20\n1;2;21\n2;4;23\n")
+    assert found.units == {} and list(found.columns) == ["speed", "flow"]
+
+
+def test_a_header_with_units_of_its_own_keeps_them(tmp_path):
+    found = read(tmp_path, "s;mA;degC\ntime [s];I [A];T [degC]\n0;1;20\n1;2;21\n2;4;23\n")
+    assert found.units == {"I": "A", "T": "degC"}

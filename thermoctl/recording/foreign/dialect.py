@@ -28,6 +28,7 @@ from thermoctl.recording.foreign.units import (
     split_slash,
     split_unit,
     split_words,
+    time_unit,
 )
 from thermoctl.units import SECONDS
 
@@ -337,6 +338,26 @@ def _is_units(cells: list[str], above: list[str]) -> bool:
     )
 
 
+def _unit_lines(lines_of: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Take the lines with units and kinds of values from those of the header, and return them."""
+    if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):
+        lines_of.pop()  # the line below the units (Origin)
+    if len(lines_of) > 1 and _are_above(lines_of[-2][1], lines_of[-1][1]):
+        return [lines_of.pop(-2)]
+    found = []
+    while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
+        found.append(lines_of.pop())
+    return found
+
+
+def _are_above(cells: list[str], names: list[str]) -> bool:
+    """Return whether a line is units of the names below it: the first one of a time, the names without any."""
+    units, others = ([known(_bare(c)) for c in line if c] for line in (cells, names))
+    stated = any(split_words(c)[1] for c in names)
+    is_time = time_unit(_bare(cells[0])) is not None
+    return is_time and all(units) and not all(others) and not stated and _is_units(cells, names)
+
+
 def _header(
     path: Path,
     head: list[tuple[int, list[str]]],
@@ -357,11 +378,7 @@ def _header(
         empty = {i for i in range(width) if data and not any(row[i] for row in data)}
         names = [f"\0{i}" if i in empty else f"column_{i + 1}" for i in range(width)]
         return tuple(names), aligned(facts, names, {}), (), set()
-    if len(lines_of) > 2 and _is_units(lines_of[-2][1], lines_of[-3][1]) and _is_remarks(lines_of[-1][1]):
-        lines_of.pop()  # the line below the units (Origin)
-    below: list[tuple[int, list[str]]] = []
-    while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
-        below.append(lines_of.pop())
+    below = _unit_lines(lines_of)
     while len(lines_of) > 1 and below and sum(bool(c) for c in lines_of[-1][1]) < width / 2:
         lines_of.pop()
     line, cells = lines_of[-1]
