@@ -6,6 +6,7 @@ foreign devices (issue 24).
 
 import os
 import struct
+import termios
 import zlib
 
 import pytest
@@ -283,6 +284,7 @@ def test_a_line_of_seven_bits_and_even_parity(tmp_path, line):
         "E",
         2,
     )  # a pty has 8 bits
+    assert termios.tcgetattr(device._fd)[0] & termios.INPCK  # pyserial ignores a wrong parity
     device.disconnect()
 
 

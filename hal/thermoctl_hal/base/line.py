@@ -24,7 +24,7 @@ NETWORK = "socket://"
 CONNECT_S = 3.0  # longest time to connect to a network adapter
 QUIET_S = 0.05  # longest pause within a line or frame: an adapter holds bytes back
 MAX_LINE = 1024  # a text line longer than this is garbage
-_CHARACTERS = 6  # index of the special characters in termios' list
+_INPUT, _CHARACTERS = 0, 6  # indices of the input's modes and the special characters in termios' list
 
 
 class LineReader:
@@ -103,6 +103,9 @@ def open_port(path: str, line: LineSettings) -> serial.Serial | socket.socket:
         set_latency_timer(path, line.latency_timer_ms)
     try:
         settings = termios.tcgetattr(port.fileno())
+        settings[_INPUT] |= (
+            termios.INPCK
+        )  # a character with wrong parity or stop bit arrives as 0, not as data
         # Without data, a read raises EAGAIN: an empty result means that the port is gone.
         settings[_CHARACTERS][termios.VMIN] = 1
         termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
