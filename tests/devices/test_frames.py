@@ -338,3 +338,47 @@ def test_mistakes_are_told_with_their_place(tmp_path, old, new, message):
     (tmp_path / "p.yaml").write_text(good.replace(old, new))
     with pytest.raises(InputError, match=rf"p.yaml:\d+:\d+: .*{message}"):
         load_profile(tmp_path / "p.yaml")
+
+
+FIELDS = "bus: serial-binary\nframe: {sync: [170], length: false, crc: none, fields: [%s]}\nchannels:\n  x: {field: x, "
+OF = {
+    "bits of a typed field": (
+        FIELDS % "{name: x, type: uint32, low_bit: 4, bits: 19}",
+        "add one for the bits",
+    ),
+    "a lowest bit alone": (FIELDS % "{name: x, type: uint16, low_bit: 2}", "belong to a field with 'of'"),
+    "a sign beside a type": (FIELDS % "{name: x, type: uint16, signed: true}", "as int16"),
+    "a type beside 'of'": (
+        FIELDS % "{name: a, type: uint16}, {name: x, of: a, bits: 3, type: int8}",
+        "no 'type'",
+    ),
+}
+SLAVE = (
+    "bus: ethercat\nethercat: {vendor_id: 2, product_code: 3, transmit: [0x6041, 0x6077]}\nchannels:\n  x: {"
+)
+OF |= {
+    "a lowest bit of an input": (
+        SLAVE + "byte: 0, type: uint16, low_bit: 4, ",
+        "0 bits from bit 4 are not inside",
+    ),
+    "a sign of an input": (SLAVE + "byte: 0, type: uint16, signed: true, ", "are not inside the 16 bits"),
+    "another type than the object's": (
+        SLAVE + "object: 0x6077, type: int32, ",
+        "type: object 0x6077 has its own",
+    ),
+}
+DRIVE = "bus: can-cia402\ncia402: {eds: a.eds, node_id: 5, command: 0x6071, transmit: [0x6041, 0x2030], mode: 10, "
+OF["types beside an EDS file"] = (
+    DRIVE + "objects: {0x2030: int16}}\nchannels:\n  x: {",
+    "the 'eds' file gives the types",
+)
+
+
+@pytest.mark.parametrize("how", OF)
+def test_a_key_that_would_have_no_effect_is_refused(tmp_path, how):
+    """Such a key was passed over, and the whole number, with its status bits, was the reading."""
+    text, words = OF[how]
+    tmp_path.joinpath("a.eds").write_text("[2030]\nDataType=4\n")
+    tmp_path.joinpath("p.yaml").write_text(HEAD + text + "unit: um, rate_hz: 10, stale_after_s: 1}\n")
+    with pytest.raises(InputError, match=words):
+        load_profile(tmp_path / "p.yaml")

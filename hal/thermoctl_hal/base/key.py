@@ -63,6 +63,17 @@ def bits_of(of: str) -> tuple[Key, ...]:
     )
 
 
+def check_bits(s: Section, k: dict[str, Any], width: int, of: str) -> None:
+    """Raise InputError where the keys of `bits_of` and `signed` are not some bits of a whole number.
+
+    width: its bits, 0 for another number. Without 'bits' the other two would have no effect."""
+    if (k["bits"] or k["low_bit"] or k["signed"]) and not 1 <= k["bits"] <= width - k["low_bit"]:
+        raise s.node.error(
+            f"{s.what}: {k['bits']} bits from bit {k['low_bit']} are not inside {of}; "
+            "'low_bit', 'bits' and 'signed' say which bits of a whole number hold the value"
+        )
+
+
 def whole_range(bits: int, is_signed: bool) -> tuple[int, int]:
     """Return the least and the largest whole number of so many bits."""
     return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)

@@ -146,6 +146,10 @@ def read_cia402(top: Section, folder: Path) -> Cia402:
     eds = folder / k["eds"] if k["eds"] else None
     if eds is not None and not eds.is_file():
         raise s.get("eds").error(f"eds: {eds} cannot be read: no such file")
+    if eds is not None and k["objects"] is not None:
+        raise s.get("objects").error(
+            "objects: the 'eds' file gives the types: correct it there, or leave it out"
+        )
     transmit = tuple(read_object_name(n, "transmit") for n in k["transmit"])
     if not transmit or transmit[0] != STATUS_WORD:
         raise s.get("transmit").error("transmit: the objects of TPDO 1, the status word '0x6041' first")

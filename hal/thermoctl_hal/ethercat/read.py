@@ -10,7 +10,7 @@ from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
 from thermoctl_hal.base.cia402 import OBJECT_TYPES, STANDARD_TYPES, START_UP, read_object_name
-from thermoctl_hal.base.key import sentinel_of, take
+from thermoctl_hal.base.key import check_bits, sentinel_of, take
 from thermoctl_hal.base.profile import (
     FIELD_TYPES,
     STATUS_WORD,
@@ -161,9 +161,12 @@ def read_place(s: Section, spec: BusSpec) -> Place:
         invalid = _place(k["invalid"], i, slave), Condition("", i["mask"], i["good"])
         k["invalid"].end()
     place = _place(s, k, slave)
-    width = 8 * (place.end - place.offset)
-    if k["bits"] and (place.letter in "fd" or k["low_bit"] + k["bits"] > width):
-        raise s.get("bits").error(f"bits: {k['low_bit']} + {k['bits']} are not inside the {width} bits of it")
+    width = 0 if place.letter in "fd" else 8 * (place.end - place.offset)
+    check_bits(s, k, width, f"the {width} bits of it")
+    if k["object"] is not None and k["type"]:
+        raise s.get("type").error(
+            f"type: object {k['object'].value} has its own: leave it out, or give its 'byte'"
+        )
     return Place(
         place.offset,
         place.letter,

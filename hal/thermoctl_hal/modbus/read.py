@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, number_of
-from thermoctl_hal.base.key import sentinel_of, take
+from thermoctl_hal.base.key import check_bits, sentinel_of, take
 from thermoctl_hal.base.profile import (
     BIT_KINDS,
     REGISTER_TYPES,
@@ -69,7 +68,8 @@ def read_register(s: Section, spec: BusSpec) -> Register:
     )
     if source.address + source.words > REGISTERS or source.words > typed(spec, Modbus).max_block:
         raise s.node.error(f"register: {source.words} registers from {source.address} do not fit")
-    _check_bits(s, k, source)
+    width = _WORD_BITS * source.words if "int" in source.type else 0
+    check_bits(s, k, width, f"a {source.type}")
     return replace(source, sentinels=tuple(_sentinel(n, source) for n in k["sentinels"] or ()))
 
 
@@ -85,16 +85,6 @@ def _sentinel(node: Node, source: Register) -> float:
         return float(value)
     letter = {"float32": "f", "float64": "d"}.get(source.type, "")
     return sentinel_of(node, width, not source.type.startswith("u"), letter)
-
-
-def _check_bits(s: Section, k: dict[str, Any], source: Register) -> None:
-    if (k["bits"] or k["low_bit"] or k["signed"]) and (
-        not 1 <= k["bits"] <= source.words * _WORD_BITS - k["low_bit"] or "int" not in source.type
-    ):
-        raise s.node.error(
-            f"{s.what}: {k['bits']} bits from bit {k['low_bit']} are not inside a {source.type}; "
-            "'low_bit', 'bits' and 'signed' say which bits of a whole number hold the value"
-        )
 
 
 def _invalid(s: Section | None) -> tuple[Register, Condition] | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from thermoctl.files.yamlfile import Node, Section, integer_of, suggest
 from thermoctl_hal.base.checksum import ALIASES, SUMS, algorithm, names
-from thermoctl_hal.base.key import named, take
+from thermoctl_hal.base.key import check_bits, named, take
 from thermoctl_hal.base.profile import (
     FRAME_TYPES,
     BinaryFrame,
@@ -119,6 +119,11 @@ def _fields(s: Section, nodes: list[Node]) -> tuple[tuple[tuple[str, str], ...],
             raise node.error("field: 'name' is missing")
         if k["of"]:
             bits.append(_bits(f, k, name, fields))
+        elif k["bits"] or k["low_bit"] or k["signed"]:
+            raise node.error(
+                f"field '{name}': 'bits', 'low_bit' and 'signed' belong to a field with 'of': add one for the bits, "
+                "of this field; a sign is part of the type, as int16"
+            )
         elif k["type"] not in FRAME_TYPES:
             raise node.error(
                 f"type: '{k['type']}' is not one of {_TYPES}{suggest(k['type'], FRAME_TYPES)}"
@@ -147,11 +152,10 @@ def _bits(f: Section, k: dict[str, Any], name: str, fields: list[tuple[str, str]
     kinds = dict(fields)
     of = named(f, "of", kinds)
     kind, size = FRAME_TYPES[kinds[of]]
-    width = 4 * size if kind == "hex" else 8 * size
-    if kind not in ("int", "uint", "hex") or not 1 <= k["bits"] <= width - k["low_bit"]:
-        raise f.node.error(
-            f"field '{name}': {k['bits']} bits from bit {k['low_bit']} are not inside '{of}', a {kinds[of]}"
-        )
+    widths = {"int": 8 * size, "uint": 8 * size, "hex": 4 * size}
+    check_bits(f, k, widths.get(kind, 0), f"'{of}', a {kinds[of]}")
+    if not k["bits"] or k["type"]:
+        raise f.node.error(f"field '{name}': it is some bits of '{of}': give 'bits', and no 'type'")
     return Bits(name, of, k["low_bit"], k["bits"], k["signed"])
 
 
