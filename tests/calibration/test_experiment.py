@@ -1,7 +1,9 @@
 """From experiment to compensation: tests run and recorded, identified, installed, loaded by the daemon, refused elsewhere, rolled back."""
 
 import dataclasses
+import errno
 import re
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from thermoctl.daemon.tick.assemble import compensator
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile
 from thermoctl.identify.online import Tuner
+from thermoctl.recording import files
 from thermoctl.recording.files import read_table
 from thermoctl.rig.signals import INDEX
 
@@ -258,3 +261,36 @@ def test_an_experiment_at_the_wire_is_ended_and_goes_on(tmp_path):
         assert not out.with_name("short.parquet.progress").exists() and chain.status()["state"] != "ARMED"
     finally:
         chain.stop()
+
+
+BRIEF = "  brief: {title: Brief, parts: [{hold: [[1, 0], [2, 5]]}]}\n"
+
+
+@pytest.mark.parametrize(
+    "out,words", [("none/a.csv", "none/a.csv: cannot be written: No such"), ("a.txt", "not '.txt'")]
+)
+def test_no_test_moves_a_rig_whose_rows_could_not_be_written(quick, capsys, out, words):
+    """A wrong folder or suffix was found after the last move, and the rows of hours were lost."""
+    (quick / "experiments.yaml").write_text(SHORT + BRIEF)
+    assert cli.main(["experiment", "brief", "--config", "rig.yaml", "--out", out]) == 2
+    said = capsys.readouterr()
+    assert words in said.err and "moves the output" not in said.out
+
+
+def test_the_rows_of_a_test_are_kept_where_its_disk_is_full(quick, capsys, monkeypatch):
+    write, calls = files.write_arrow, []
+
+    def full_once(path, *arguments):
+        calls.append(path)
+        if len(calls) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, *arguments)
+
+    monkeypatch.setattr(files, "write_arrow", full_once)
+    monkeypatch.setattr(tempfile, "tempdir", str(quick))
+    (quick / "experiments.yaml").write_text(SHORT + BRIEF)
+    assert cli.main(["experiment", "brief", "--config", "rig.yaml", "--out", "a.csv"]) == 2
+    said = re.search(
+        r"a\.csv: No space left .* its (\d+) rows are in (\S+a\.csv): move", capsys.readouterr().err
+    )
+    assert said and len(read_table(said[2])) == int(said[1]) > 20 and not (quick / "a.csv").exists()

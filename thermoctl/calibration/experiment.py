@@ -5,6 +5,7 @@ A test of setpoints on a rig, or an experiment of inputs on a plant file."""
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,12 @@ from thermoctl.calibration import drive, schedules
 from thermoctl.calibration.keyboard import Keyboard
 from thermoctl.calibration.recorded import as_table
 from thermoctl.configuration.settings import Settings
-from thermoctl.files.safe_file import write_text
+from thermoctl.files.safe_file import WriteError, check_writable, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
-from thermoctl.recording.files import write_table
+from thermoctl.recording.files import table_kind, write_table
 from thermoctl.recording.table import Table
 
 ENDED = 3  # exit status of a test that ended early
@@ -72,10 +73,24 @@ def on_rig(
     print("\n".join(schedules.power_lines(settings, schedule)))
     if dry_run:
         return 0
+    table_kind(path)
+    check_writable(path)
     rig = drive.rig_of(settings)
     if not drive.agreed(rig, [schedule], yes):
         return 1
     return _record(rig, schedule, path, resume)
+
+
+def _write(path: Path, table: Table) -> None:
+    """Write the rows of a test, in the folder of temporary files where `path` cannot be written any more."""
+    try:
+        write_table(path, table)
+    except WriteError as e:
+        spare = Path(tempfile.mkdtemp(prefix="thermoctl-"), path.name)
+        write_table(spare, table)
+        raise InputError(
+            f"{e.why}; its {len(table)} rows are in {spare}: move them before a restart"
+        ) from None
 
 
 def _progress(path: Path) -> Path:
@@ -107,7 +122,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
             ended = e.reason
         if blocks:
             rows = np.vstack(blocks)
-            write_table(path, as_table(rows, path, rig.settings.row))
+            _write(path, as_table(rows, path, rig.settings.row))
         if ended:
             write_text(_progress(path), f"{done_s[0]:.3f}\n")
     if blocks:

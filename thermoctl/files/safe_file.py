@@ -119,6 +119,14 @@ def write_text(path: str | Path, text: str, remedy: str = "", sync: bool = True)
         Path(part).write_text(text, encoding="utf-8")
 
 
+def check_writable(path: str | Path) -> None:
+    """Raise WriteError where no file can be written at `path`, before hours of work for it."""
+    with _reported(path, ""):
+        fd, part = part_file(Path(os.path.realpath(path)))
+        os.close(fd)
+        os.unlink(part)
+
+
 def move(source: str | Path, target: str | Path) -> None:
     """Sync a file that is whole, and rename it within its file system. Raises OSError."""
     fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)

@@ -73,12 +73,17 @@ def write_table(path: str | Path, table: Table) -> None:
 
     The file appears whole or not at all. Raises InputError for another suffix or when the place cannot be
     written."""
-    path = Path(path)
+    kind = table_kind(Path(path))
+    with whole_file(path) as temporary:
+        write_arrow(temporary, kind, to_arrow(table))
+
+
+def table_kind(path: Path) -> str:
+    """Return the suffix of a table in small letters. Raises InputError for one that no table has."""
     kind = path.suffix.lower()
     if kind not in (".csv", ".parquet", ".arrow"):
         raise InputError(f"{path}: a table is written as .csv, .parquet or .arrow, not '{path.suffix}'")
-    with whole_file(path) as temporary:
-        write_arrow(temporary, kind, to_arrow(table))
+    return kind
 
 
 def write_arrow(path: str, kind: str, arrow: pa.Table) -> None:
