@@ -110,19 +110,6 @@ class FaultInjector:
         self._value, self._time_s = self.sample.value.copy(), self.sample.time_s.copy()
         self._held: dict[tuple[int, int], float] = {}  # (fault, role) -> frozen value
         self._late: dict[tuple[int, int], deque[tuple[float, float]]] = {}
-        self._apply = {
-            "drop": self._drop,
-            "delay": self._delay,
-            "duplicate": self._duplicate,
-            "corrupt": self._corrupt,
-            "freeze": self._freeze,
-            "nan": self._nan,
-            "step": self._step,
-            "drift": self._drift,
-            "set": self._set,
-            "error": self._error,
-            "disconnect": self._error,
-        }
 
     def open(self) -> None:
         """Open the inner back end; the schedule starts with the first read."""
@@ -149,7 +136,7 @@ class FaultInjector:
             elif fault.kind != "stuck":
                 for role in fault.roles:
                     if inner.status[role] != ABSENT:
-                        self._apply[fault.kind](fault, number, role, now_s)
+                        getattr(self, f"_{fault.kind}")(fault, number, role, now_s)  # every kind is a method
         return out
 
     def write(self, drive: float, enable: bool) -> None:
@@ -243,3 +230,5 @@ class FaultInjector:
 
     def _error(self, fault: Fault, number: int, role: int, now_s: float) -> None:
         self.sample.fresh[role], self.sample.status[role] = False, ERROR
+
+    _disconnect = _error
