@@ -64,7 +64,7 @@ class LineReader:
             self.reset()
 
     def reset(self, is_amid: bool = False) -> None:
-        """Drop an incomplete line. is_amid: the next bytes may be the end of a line, which is dropped, too."""
+        """Drop an incomplete line. is_amid: drop the next one, too, which may be the end of a line."""
         self._buffer.clear()
         self._dropping = is_amid
 

@@ -111,7 +111,7 @@ def _misread(text: str, database: Database) -> dict[str, str]:
     """Return the signals whose kind or page cantools passes over, and why.
 
     It does so at the end of a file that was cut off. Where several multiplexers, or none, could select a
-    page, it takes the signal from every page. The signals on pages of such a multiplexer are left out, too."""
+    page, it takes the signal from every page. Signals on pages of such a multiplexer are unusable."""
     faults: dict[str, str] = {}
     for block in _blocks(text, faults)[0]:
         for line, signal in block.lines[1:]:
@@ -133,7 +133,7 @@ def _misread(text: str, database: Database) -> dict[str, str]:
 
 
 def multiplexers(message: Message, name: str) -> Iterator[str]:
-    """Yield the multiplexer that selects the page of a signal, then the one that selects its own, and so on."""
+    """Yield the multiplexer that selects the page of a signal, then that of its own page, and so on."""
     by_name = {s.name: s.multiplexer_signal for s in message.signals}
     for _ in by_name:  # a faulty file may let two of them select each other
         if not (name := by_name.get(name) or ""):

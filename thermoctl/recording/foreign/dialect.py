@@ -351,7 +351,7 @@ def _unit_lines(lines_of: list[tuple[int, list[str]]]) -> list[tuple[int, list[s
 
 
 def _are_above(cells: list[str], names: list[str]) -> bool:
-    """Return whether a line is units of the names below it: the first one of a time, the names without any."""
+    """Return whether a line is units of the names below: the first one of a time, the names without any."""
     units, others = ([known(_bare(c)) for c in line if c] for line in (cells, names))
     stated = any(split_words(c)[1] for c in names)
     is_time = time_unit(_bare(cells[0])) is not None
