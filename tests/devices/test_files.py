@@ -13,6 +13,7 @@ from thermoctl_hal.base.units import dbc_unit
 from thermoctl_hal.can.bus import BY_PGN, EXTENDED, is_wanted, pgn_of
 from thermoctl_hal.can.dbc_file import load_dbc
 from thermoctl_hal.can.eds import read_eds
+from thermoctl_hal.virtual.slcan import DbcSender
 
 START = 'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: DEV HOST\n\n'
 GOOD = 'BO_ 801 READING: 8 DEV\n SG_ Volts : 0|16@1- (0.01,0) [0|0] "V" HOST\n SG_ T : 16|8@1+ (1,-40) [0|0] "°C" HOST\n\n'
@@ -618,3 +619,16 @@ def test_a_command_that_cannot_be_encoded_is_refused(tmp_path, how):
     with pytest.raises(InputError, match=words) as e:
         make(tmp_path, HEAD + COMMAND % "Amps", "virtual:x", "{state: amplifier_state, v: voltage_v}")
     assert re.match(r".*device\.yaml:\d+:\d+: (command|message): ", str(e.value))
+
+
+@pytest.mark.parametrize("factor", ["(1,0)", "(2,1)"])
+def test_the_virtual_rig_sends_every_page_that_has_a_reading(tmp_path, factor):
+    """It ended with a traceback where no page had the number 0, and sent no page but that one."""
+    pages = NESTED.replace(" Sub m1M : 8|8@1+ (1,0)", f" Sub m1M : 8|8@1+ {factor}").rstrip("\n")
+    pages += '\n SG_ T m2 : 16|8@1+ (1,-40) [0|0] "degC" HOST\n\n' + PAGES + "SG_MUL_VAL_ 801 T Sub 2-2;\n"
+    dev = device(tmp_path, START + pages, [V, T])
+    sender = object.__new__(DbcSender)
+    sender.binding, sender._spec = dev.binding, dev.binding.profile.bus_spec
+    sender.reading = lambda bound: {"voltage_v": 12.34, "air_c": 21.0}[bound.role]
+    sample = read(dev, *sender.frames("READING"))
+    assert sample.value[ROLE["voltage_v"]] == pytest.approx(12.34) and sample.value[ROLE["air_c"]] == 21

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from thermoctl_hal.base.key import whole_range
@@ -22,6 +22,7 @@ from thermoctl_hal.base.profile import (
 from thermoctl_hal.base.wire import Framer
 
 if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can import Message as DbcMessage
     from cantools.database.can.signal import Signal
 
 _ADDRESS = re.compile(rb"\{address(:[^{}]*)?\}")
@@ -73,6 +74,15 @@ def _raw(signal: Signal, value: float) -> float:
     """Return the number that a signal carries; a signal without a factor cannot be sent."""
     exact = (value - signal.offset) / signal.scale if signal.scale else 0.0
     return exact if signal.is_float else round(exact)
+
+
+def multiplexers(message: DbcMessage, name: str) -> Iterator[str]:
+    """Yield the multiplexer that selects the page of a signal, then that of its own page, and so on."""
+    by_name = {s.name: s.multiplexer_signal for s in message.signals}
+    for _ in by_name:  # a faulty file may let two of them select each other
+        if not (name := by_name.get(name) or ""):
+            return
+        yield name
 
 
 def clipped(value: float, register: Register) -> float:

@@ -13,11 +13,10 @@ from thermoctl_hal.base.amplifier import Commanded
 from thermoctl_hal.base.backend import HardwareError, Sample
 from thermoctl_hal.base.binding import Binding
 from thermoctl_hal.base.device import Device
-from thermoctl_hal.base.message import can_frame
+from thermoctl_hal.base.message import can_frame, multiplexers
 from thermoctl_hal.base.profile import Amplifier, Assumed, CanMessage, Dbc, DbcSource, Message, typed
 from thermoctl_hal.base.wire import EXTENDED
 from thermoctl_hal.can.bus import BY_PGN, AnyPort, open_can, pgn_of
-from thermoctl_hal.can.dbc_file import multiplexers
 
 if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Message as DbcMessage

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from thermoctl_hal.base.message import multiplexers
 from thermoctl_hal.base.text_file import read_text, while_same
 
 if TYPE_CHECKING:  # loading cantools takes a second
@@ -130,15 +131,6 @@ def _misread(text: str, database: Database) -> dict[str, str]:
             if s.name in chain:
                 unread[m.name] = f"{s.name} selects its own page: correct its SG_MUL_VAL_ line"
     return unread
-
-
-def multiplexers(message: Message, name: str) -> Iterator[str]:
-    """Yield the multiplexer that selects the page of a signal, then that of its own page, and so on."""
-    by_name = {s.name: s.multiplexer_signal for s in message.signals}
-    for _ in by_name:  # a faulty file may let two of them select each other
-        if not (name := by_name.get(name) or ""):
-            return
-        yield name
 
 
 def _first_line(error: Exception) -> str:

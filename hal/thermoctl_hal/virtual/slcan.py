@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.binding import Binding, Bound
+from thermoctl_hal.base.message import can_frame, multiplexers
 from thermoctl_hal.base.profile import (
     ERROR_CODE,
     POSITION_MODES,
@@ -25,6 +27,9 @@ from thermoctl_hal.base.wire import encode_slcan
 from thermoctl_hal.virtual.device import Pty, PtyDevice
 from thermoctl_hal.virtual.drive import ENABLED, Cia402Drive, Frame, SlcanAdapter
 from thermoctl_hal.virtual.plants import Readings
+
+if TYPE_CHECKING:  # loading cantools takes a second
+    from cantools.database.can import Message as DbcMessage
 
 
 class SlcanLine(Pty):
@@ -159,21 +164,33 @@ class DbcSender(SlcanDevice):
     def tick(self, now_s: float, tick: int) -> None:
         """Send the messages that are due at now_s."""
         if not self.mute and self.line.adapter.open:
-            due = [self._message(name) for name, every in self._every.items() if tick % every == 0]
+            due = [f for name, every in self._every.items() if tick % every == 0 for f in self.frames(name)]
             self.pty.send(b"".join(encode_slcan(*frame) for frame in due))
 
-    def _message(self, name: str) -> Frame:
-        """Return a message with the present readings."""
-        message = self._spec.database.get_message_by_name(name)
-        values = dict.fromkeys((s.name for s in message.signals), 0.0)
+    def frames(self, name: str) -> list[Frame]:
+        """Return a message with the present readings: a frame for each page that has one of them."""
+        spec, address, signals = self._spec, self.binding.address, dict[str, float | None]()
         for b in self.binding.bounds:
             source = typed(b.channel.source, DbcSource)
             if source.message == name:
-                values[source.signal] = self.reading(b) or 0.0
-        can_id, address = self._spec.can_id(name, self.binding.address), self.binding.address
-        if address >= 0 and self._spec.is_j1939(name, address):
-            can_id = can_id & ~0xFF | address
-        return can_id, bytes(message.encode(values, strict=False))
+                signals[source.signal] = self.reading(b) or 0.0
+        message = spec.database.get_message_by_name(name)
+        every = {s.name: tuple(page_of(message, s.name)) for s in message.signals}
+        pages = {every[n] for n in signals if every[n]} or {max(every.values(), key=len)}
+        frames = []
+        for page in pages:
+            can_id, data = can_frame(CanMessage(name, signals | dict(page)), spec, 0.0, address)
+            is_asked = address >= 0 and spec.is_j1939(name, address)
+            frames.append((can_id & ~0xFF | address if is_asked else can_id, data))
+        return frames
+
+
+def page_of(message: DbcMessage, name: str) -> Iterator[tuple[str, float]]:
+    """Yield the multiplexers of a signal's page, each with a value that selects it."""
+    signal = message.get_signal_by_name(name)
+    for by in multiplexers(message, name):
+        ids, signal = signal.multiplexer_ids or [0], message.get_signal_by_name(by)
+        yield by, ids[0] * signal.scale + signal.offset
 
 
 class DbcAmplifier(DbcSender):
