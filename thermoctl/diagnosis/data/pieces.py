@@ -48,8 +48,8 @@ def in_pieces(plant: Plant, tables: Sequence[Table]) -> tuple[list[Table], list[
 def with_free_starts(plant: Plant, tables: Sequence[Table]) -> Plant:
     """Return a plant whose unread states may start anywhere in their range over its runs.
 
-    What the plant file states of such a start holds for a recording, not for its pieces. Where the plant
-    cannot be simulated, it is returned as it is."""
+    A start that the plant file states holds for a recording, not for its pieces. Where the plant cannot be
+    simulated, it is returned as it is."""
     model, read = compile_plant(plant), direct_outputs(plant)
     loose = [n for n in model.uncertain if n not in read]
     try:

@@ -41,8 +41,8 @@ def _choices(rig: Rig, effect: Effect, place: Place) -> list[dict[str, Expr]]:
 def _placed(rig: Rig, effect: Effect) -> Iterator[tuple[Place, Effect]]:
     """Yield the places where an effect can act, each with the entry for it.
 
-    A reading that the plant trusts has no fault. Without an ambient nothing reads it. What does not grow has
-    no lag of its growth."""
+    A reading that the plant trusts has no fault. Without an ambient nothing reads it. A position that
+    does not grow has no lag of its growth."""
     if effect.in_air and not rig.air:
         return
     for place in PLACES[effect.where](rig):

@@ -45,7 +45,8 @@ def words(result: Result) -> str:
 def sentences(result: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
     rows = outputs(result)
-    laws = [law_sentence(law) for law in every_law(_law(result))]
+    every = every_law(_law(result))
+    laws = [law_sentence(law, f"The law at {law['where']}" if every[1:] else "A law for it") for law in every]
     texts = [_found(result, rows), *_families(result), *laws]
     if rows and (result["findings"] or laws):
         texts.append(_gain(result, max(rows, key=lambda o: o.gain)))
@@ -115,8 +116,8 @@ def _law(result: Result) -> Result | None:
     return (result["remainder"] or {}).get("law")
 
 
-def law_sentence(entry: Result) -> str:
-    """Return a sentence on a law of the remainder."""
+def law_sentence(entry: Result, head: str = "A law for it") -> str:
+    """Return a sentence on a law of the remainder, which begins with `head`."""
     values = ", ".join(
         f"{n} = {with_interval(p['value'], p['sd'], p['unit'])} {p['unit'] or ''}".removesuffix(" 1").strip()
         for n, p in entry["parameters"].items()
@@ -128,7 +129,7 @@ def law_sentence(entry: Result) -> str:
         f"a flow {ends}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
     )
     chances = f"probability {chance(entry['probability'])}"
-    return f"A law for it: {acts}, {entry['expression']}, with {values} ({chances})."
+    return f"{head}: {acts}, {entry['expression']}, with {values} ({chances})."
 
 
 def _likely(result: Result) -> list[Result]:
