@@ -23,6 +23,7 @@ from thermoctl.diagnosis.law.refit import PlacedLaw, equation, laws_of
 from thermoctl.diagnosis.law.result import law_entry, wrong_ends
 from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
+from thermoctl.diagnosis.report.words import listed
 from thermoctl.diagnosis.search.beam import Searched, Weighed
 from thermoctl.diagnosis.verdict import OVERRULED
 from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
@@ -37,6 +38,7 @@ MOVES = 6.0  # an output moves if its spread is this many standard deviations of
 # Largest residual variance over the output's, if the plant is of this rig and lacks some physics.
 FOLLOWS = 0.3
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
+APART = 2.0  # ratio of an error on recordings set aside to the noise, from which it is noted
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
 CONTRADICTED = "recordings set aside contradict it"  # with it they are predicted worse
@@ -219,6 +221,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
+        *_differ(d),
         *(note for law in d.laws for note in wrong_ends(d.case, law)),
         *filter(None, [d.unknown]),
         *(
@@ -227,6 +230,26 @@ def _notes(d: Diagnosis) -> list[str]:
             for effect, where in unnamed
         ),
         *(e.candidate.effect.caution for e in d.shown if e.candidate.effect.caution),
+    ]
+
+
+def _differ(d: Diagnosis) -> list[str]:
+    """Return a sentence where recordings set aside are not followed, though nothing is missing in the others.
+
+    A recording has values of its own of the parameters that the plant file frees for each."""
+    noise, aside = d.worth.noise, d.worth.refit_only
+    over = {o: rms / noise[o] for o, rms in aside.items() if rms > APART * noise[o]}
+    if d.decision.verdict != "consistent" or not d.worth.reserved or not over:
+        return []
+    own = [q for q, p in d.case.plant.parameters.items() if p.per_recording and p.range]
+    why = (
+        f"{listed(own)} {'are' if own[1:] else 'is'} not fitted there"
+        if own
+        else "they differ from the others"
+    )
+    worst = max(over, key=lambda o: over[o])
+    return [
+        f"the error of {worst} is {over[worst]:.2g} times the noise in {listed(d.worth.names)}, set aside: {why}"
     ]
 
 
