@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from thermoctl.diagnosis.run import diagnose
-from thermoctl.plant import loads
+from thermoctl.plant import load, loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
@@ -87,5 +87,7 @@ def test_a_body_is_found_where_no_ambient_is_and_heat_is_that_of_a_square_metre(
     (found,) = result["findings"]
     assert (found["effect"], found["where"]) == ("hidden_thermal_mass", "sea")
     assert found["parameters"]["G_hidden_thermal_mass_sea"]["value"] == pytest.approx(0.75, rel=0.2)
-    assert any("units of what was added" in note for note in result["notes"]) == (not stated)
-    assert (tmp_path / "out" / "plant.yaml").exists()
+    assert any("units of what was added to the plant do not fit" in note for note in result["notes"]) == (
+        not stated
+    )
+    assert load(tmp_path / "out" / "plant.yaml").nodes.keys() > plant.nodes.keys()

@@ -60,7 +60,7 @@ def _result(job: Job, path: Path) -> dict[str, Any]:
     diagnosis = engine.decided(found)
     if wrong := relabelled(diagnosis, limits()):
         raise InputError(str(wrong[0]))
-    save(diagnosis.final.plant, path.with_name("plant.yaml"))
+    save(diagnosis.plant, path.with_name("plant.yaml"))
     load(path.with_name("plant.yaml"))
     return contract(diagnosis)
 

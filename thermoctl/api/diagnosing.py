@@ -85,7 +85,7 @@ class Diagnosis:
     @property
     def plant(self) -> Plant:
         """The plant with the findings and refitted parameters."""
-        return Plant(self.found.final.plant)
+        return Plant(self.found.plant)
 
     def save(self, folder: str | Path) -> None:
         """Write diagnosis.json and plant.yaml."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -29,10 +29,12 @@ from thermoctl.diagnosis.verdict import OVERRULED
 from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.units import check_units
 
 MOVES = 6.0  # an output moves if its spread is this many standard deviations of its noise
 # Largest residual variance over the output's, if the plant is of this rig and lacks some physics.
@@ -120,6 +122,17 @@ class Diagnosis:
         """Return the hypothesis that the result shows: `best` if it extends the plant, else `null`."""
         return self.best if self.extends else self.null
 
+    @cached_property
+    def plant(self) -> Plant:
+        """The plant of `final`, to be written; without units of what was added where they do not fit."""
+        extended, known = self.final.plant, self.case.plant.parameters
+        try:
+            check_units(extended)
+        except InputError:
+            added = {q: replace(p, unit=None) for q, p in extended.parameters.items() if q not in known}
+            return replace(extended, parameters={**extended.parameters, **added})
+        return extended
+
     @property
     def remainder(self) -> Left:
         """Return the residual of the hypothesis `final`."""
@@ -180,18 +193,7 @@ def contract(d: Diagnosis) -> dict[str, Any]:
             }
             if stays
             else None,
-            "fit": {
-                "before": rms_of(d.came, list(outputs)) if d.came else dict.fromkeys(outputs, float("nan")),
-                "refit_only": d.null.fit.rms(),
-                "after": d.final.fit.rms(),
-                "converged": d.null.fit.converged and d.final.fit.converged,
-                "held_out_before": d.worth.before,
-                "held_out_refit_only": d.worth.refit_only,
-                "held_out_after": d.worth.after if d.extends else d.worth.refit_only,
-                "held_out": "recordings " + ", ".join(d.worth.names)
-                if d.worth.reserved
-                else "cross-validated: too few recordings to set one aside",
-            },
+            "fit": _fit(d),
             "next_experiment": None,
             "decision": {"row": d.decision.row, **d.decision.numbers},
             "hypotheses": _hypotheses(d),
@@ -213,6 +215,24 @@ def contract(d: Diagnosis) -> dict[str, Any]:
     )
 
 
+def _fit(d: Diagnosis) -> dict[str, Any]:
+    """Return the errors of the plant as it came, refitted and extended, by output."""
+    return {
+        "before": rms_of(d.came, list(d.case.plant.outputs))
+        if d.came
+        else dict.fromkeys(d.case.plant.outputs, float("nan")),
+        "refit_only": d.null.fit.rms(),
+        "after": d.final.fit.rms(),
+        "converged": d.null.fit.converged and d.final.fit.converged,
+        "held_out_before": d.worth.before,
+        "held_out_refit_only": d.worth.refit_only,
+        "held_out_after": d.worth.after if d.extends else d.worth.refit_only,
+        "held_out": "recordings " + ", ".join(d.worth.names)
+        if d.worth.reserved
+        else "cross-validated: too few recordings to set one aside",
+    }
+
+
 def _notes(d: Diagnosis) -> list[str]:
     """Return the assumptions and the cautions, as sentences."""
     unnamed = [e.key for e in d.final.hypothesis.effects if e not in d.shown and not isinstance(e, PlacedLaw)]
@@ -223,6 +243,11 @@ def _notes(d: Diagnosis) -> list[str]:
         *unfinished(d.null, d.final),
         *_differ(d),
         *(note for law in d.laws for note in wrong_ends(d.case, law)),
+        *(
+            []
+            if d.plant is d.final.plant
+            else ["units of what was added to the plant do not fit it: left out"]
+        ),
         *filter(None, [d.unknown]),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "

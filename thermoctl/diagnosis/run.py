@@ -106,28 +106,13 @@ def _write(folder: Path, plant: Plant, diagnosis: Diagnosis, result: dict[str, A
     """Write all files of a result, or none."""
     with whole_files(folder, remove=experiment_file.FILES) as part:
         added = "".join(f"; with {e.key[0]} at {e.key[1]}" for e in diagnosis.shown)
-        note = f"{Path(plant.file).name}, refitted{added}"
-        save(diagnosis.final.plant, part / "plant.yaml", note)
-        try:
-            load(part / "plant.yaml")
-        except InputError as e:
-            result["notes"].append(f"units of what was added to the plant are left out: {e}")
-            save(_without_new_units(diagnosis.final.plant, plant), part / "plant.yaml", note)
-            load(part / "plant.yaml")
+        save(diagnosis.plant, part / "plant.yaml", note=f"{Path(plant.file).name}, refitted{added}")
+        load(part / "plant.yaml")
         _report(diagnosis, result, part / "report.html")
         write_text(part / "diagnosis.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
         memory.write(part, plant, _remembered(diagnosis))
         if proposed:
             experiment_file.write(part, diagnosis.case, *proposed)
-
-
-def _without_new_units(extended: Plant, plant: Plant) -> Plant:
-    """Return an extended plant whose new parameters have no units: they do not fit this plant's."""
-    parameters = {
-        q: p if q in plant.parameters else dataclasses.replace(p, unit=None)
-        for q, p in extended.parameters.items()
-    }
-    return dataclasses.replace(extended, parameters=parameters)
 
 
 def _report(diagnosis: Diagnosis, result: dict[str, Any], path: Path) -> None:

@@ -388,9 +388,7 @@ def _check_use(plant: Plant, items: Items) -> None:
     for name, s in items["inputs"].items():
         i = plant.inputs[name]
         if name not in used and i.role is None and not _is_flow(i.unit):
-            raise s.node.error(
-                f"input '{name}': nothing reads it; use it, give it a role, or remove it (its column may stay)"
-            )
+            raise s.node.error(f"input '{name}': nothing reads it; use it, give it a role, or remove it")
 
 
 def _is_flow(unit: str | None) -> bool:
