@@ -487,6 +487,79 @@ def test_a_flow_may_go_with_a_quotient_and_with_the_distance_to_an_input():
     assert law.fit.rms()["speed"] < 0.055
 
 
+CLIMATE = """\
+format: thermoctl-plant/1
+title: A planet whose ice reflects the sun
+inputs:
+  sun: {between_samples: hold}
+parameters:
+  C: {value: 20, range: [5, 80]}
+  a: {value: 180, range: [100, 260]}
+  b: {value: 3.0, range: [0.5, 6]}
+nodes:
+  T: {storage: C, initial: 10, initial_sigma: 2}
+flows:
+  in: {into: T, rate: 0.7 * sun}
+  out: {from: T, rate: a + b * T}
+outputs:
+  thermometer: {value: T, noise: 0.15}
+"""
+
+
+def test_a_flow_may_go_with_a_step_of_any_width_of_one_signal_times_another():
+    """A step of fixed width, and a peak, had been found instead (the albedo of ice, Budyko 1969)."""
+    plant, t = loads(CLIMATE), np.arange(0.0, 200.0)
+    less = Flow("less", ex.parse("0.09 * sun * tanh((T - 8) / 5)"), None, "T")
+    truth = compile_plant(replace(plant, flows={**plant.flows, "less": less}))
+    sun = np.repeat(np.random.default_rng(5).uniform(180, 420, 20), 10)
+    table = truth.measure(Table("run", "", t, {"sun": sun}), 1)
+    known = case(plant, [table], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    best = propose_laws(known, null, limits())[0]
+    assert [(x.form.name, {s.label for s in x.signals}) for x in best.terms] == [
+        ("logistic_product", {"T", "sun"})
+    ]
+    law = refitted_law(known, null, best, null)
+    assert law.fit.rms()["thermometer"] < 0.16
+
+
+ENZYME = """\
+format: thermoctl-plant/1
+title: An enzyme without inhibition
+parameters:
+  Vmax: {value: 0.7, range: [0.05, 10]}
+  Km: {value: 5}
+nodes:
+  S: {storage: 1, initial: first(substrate), initial_sigma: 0.3}
+  P: {storage: 1, initial: first(product), initial_sigma: 0.3}
+flows:
+  conversion: {from: S, into: P, rate: Vmax * S / (Km + S)}
+outputs:
+  substrate: {value: S, noise: 0.2}
+  product: {value: P, noise: 0.2}
+"""
+
+
+def test_a_law_may_change_a_flow_of_the_plant_and_reads_no_column_of_noise():
+    """The product inhibits. A sum of three terms had been found, with a recorded temperature that never changed."""
+    plant, tables = loads(ENZYME), []
+    inhibited = ENZYME.replace("0.7", "1.1").replace("(Km + S)", "(Km + S) / (1 + P / 6)")
+    truth = compile_plant(loads(inhibited))
+    for k, (s, p) in enumerate([(30.0, 0.0), (20.0, 15.0), (40.0, 5.0)]):
+        t, columns = np.arange(0.0, 120.0, 3.0), {}
+        start = {"substrate": np.full(len(t), s), "product": np.full(len(t), p)}
+        columns["temp"] = 25 + np.random.default_rng(k).normal(0, 0.1, len(t))
+        tables.append(truth.measure(Table(f"run_{k}", "", t, start | columns), k))
+        tables[-1].columns["temp"] = columns["temp"]
+    known = case(plant, tables, {}, Budget(80))
+    assert known.rig(plant, known.drives(compile_plant(plant))).spare == []
+    null = fitted(known, plant, (), known.null)
+    best = propose_laws(known, null, limits())[0]
+    assert [(x.form.name, x.variables) for x in best.terms] == [("saturation_product", {"P", "conversion"})]
+    law = refitted_law(known, null, best, null)
+    assert max(law.fit.rms().values()) < 0.22
+
+
 def test_a_column_that_a_recording_set_aside_lacks_is_no_signal():
     """A law of the voltage was found, and then could not be measured there: the diagnosis ended in an error."""
     plant, t = loads(CLAMP), np.arange(0, 0.2, 0.0008)

@@ -55,8 +55,13 @@ def entered(case: Case, f: Fitted, where: Sequence[Place], most: int) -> list[st
 def choices(
     rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
 ) -> list[tuple[Place, Signal]]:
-    """Return the places at some nodes, each with every signal that a law there may depend on."""
-    return [(p, s) for p in where if {*p.nodes} & {*nodes} for s in signals(rig, p, linear.metric.signals)]
+    """Return the places at some nodes, each with every signal that a law there may depend on.
+
+    A flow between nodes that the plant file does not link has to explain something at both."""
+    links = [{f.source, f.target} for f in rig.physics.flows.values()]
+    at = [p for p in where if {*p.nodes} & {*nodes}]
+    at = [p for p in at if {*p.nodes} <= {*nodes} or not p.source or p.flows or {*p.nodes} in links]
+    return [(p, s) for p in at for s in signals(rig, p, linear.metric.signals)]
 
 
 def log_number(combos: Sequence[tuple[Place, Signal]]) -> float:

@@ -30,7 +30,7 @@ from thermoctl.diagnosis.law.free import (
     ranked,
     unlikely,
 )
-from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
+from thermoctl.diagnosis.law.signals import Place, Signal, places, rates, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import chunks
@@ -121,7 +121,7 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
     """Return the most promising laws, best first. Raises SimulationError."""
     rig, where, linear = linearised(case, parent)
     combos = choices(rig, where, linear.likely[:NODES], linear)
-    pool = _terms(linear, ranked(linear, combos), COMBINATIONS)
+    pool = _terms(rig, linear, ranked(linear, combos), COMBINATIONS)
     base = log_number(combos), limits
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
@@ -130,12 +130,13 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
     return _mixed(out)
 
 
-def _terms(linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
+def _terms(rig: Rig, linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
     """Return terms over the first `count` of ranked places and signals, the best first."""
     pool: list[Found] = []
     for place in dict.fromkeys(p for _, p, _ in free[:count]):
         first = [s for _, p, s in free[:count] if p == place]
-        every = [s for _, p, s in free if p == place][:SECOND]
+        own = [s for _, p, s in free if p == place]
+        every = [*own[:SECOND], *rates(rig, place, linear.metric.signals, own)]
         pool += _singles(linear, place, first, every)
     pool.sort(key=lambda f: -f.gain)
     return sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])], key=lambda f: -f.gain)
@@ -162,11 +163,14 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     for n, other in (best, best[::-1]):
         beside = linear.beside(other, couples[best][1])
         free = ranked(beside, [c for c in combos if c[0] == Place(n)])
-        each.append([f for f in _varied(_terms(beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH])
+        each.append(
+            [f for f in _varied(_terms(rig, beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH]
+        )
     out = []
     for a, b in itertools.product(*each):
         x = [linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)]
         promise, c = predicted(linear, np.concatenate(x, axis=1))
+        promise -= cost_of(linear, len(c) + sum(len(f.term.form.shapes) for f in (a, b)))
         laws = (
             Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
         )
@@ -195,7 +199,10 @@ def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequ
     duration = max(float(d.t[-1]) for d in linear.metric.drives)
     sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
-    for part in chunks(families(first, every, duration, sample), lambda f: f.count, CHUNK):
+    tried = families(first, every, duration, sample)
+    if place.part == "storage":
+        tried = [f for f in tried if not f.form.memory]  # a capacity remembers nothing
+    for part in chunks(tried, lambda f: f.count, CHUNK):
         of_families = zip(*(linear.along(f.values) for f in part), strict=True)
         x = linear.columns(place, [np.concatenate(q, axis=1) for q in of_families])
         ends = np.cumsum([f.count * len(f.form.sizes) for f in part])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from thermoctl.units import conversion, dimension
 
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
 FOLLOWS = 0.9  # share of a column's variance that a node or an output shows, above which it may be a reading
+ALIKE = 1 - 1e-6  # correlation about zero from which two signals are one
 DRAWS = 5  # number of values of all names for which two rates are compared
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
@@ -86,6 +88,7 @@ class Signal:
 def places(rig: Rig) -> list[Place]:
     """Return the places of laws: flows into and between nodes, storages, and conversions.
 
+    Nodes that flows link, also through others, hold the same: between any two of them there may be one more.
     A position is no such node. A storage of 1 is a definition: dn/dt is the sum of the flows."""
     positions = set(rig.pairs.values())
     flows = rig.physics.flows.values()
@@ -93,9 +96,19 @@ def places(rig: Rig) -> list[Place]:
         n for n in rig.physics.nodes if n not in positions and any(n in (f.source, f.target) for f in flows)
     ]
     pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
+    pairs |= {p for p in combinations(nodes, 2) if p[::-1] not in pairs and p[1] in _linked(p[0], pairs)}
     stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
     joined = conversions(rig.physics, nodes)
     return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored, *joined]
+
+
+def _linked(node: str, pairs: Collection[tuple[str, str]]) -> set[str]:
+    """Return the nodes that pairs link to a node, directly or through others."""
+    found, new = set[str](), {node}
+    while new:
+        found |= new
+        new = {n for pair in pairs if found & {*pair} for n in pair} - found
+    return found
 
 
 def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:
@@ -176,12 +189,28 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     return [s for s in sized if s is not None]
 
 
+def rates(rig: Rig, place: Place, runs: Sequence[Values], beside: Sequence[Signal]) -> list[Signal]:
+    """Return the plant's own flows at a place that no signal `beside` them is in proportion to.
+
+    As factors of a law: inhibition, fouling and wear change a flow that the plant has."""
+    ends = {place.target, place.source} - {None}
+    at = [f for f in rig.physics.flows.values() if ends <= {f.source, f.target} and not ex.calls_fmu(f.rate)]
+    known = [_values(s.value, runs) for s in beside]
+    out = []
+    for f in at if place.part == "flow" else ():
+        v = _values(f.rate, runs)
+        alike = any(abs(v @ w) > ALIKE * np.linalg.norm(v) * np.linalg.norm(w) for w in known)
+        s = None if alike else _sized(Signal(f.name, f.rate, f.unit), runs)
+        out += [s] if s else []
+    return out
+
+
 def _follows(column: str, p: Plant, runs: Sequence[Values]) -> bool:
     """Return whether an unread column follows a node or an output, so that it may be a reading of it.
 
     A law of such a column would lead the plant to its own recording."""
     read = [*map(name, (column, *p.nodes)), *(o.value for o in p.outputs.values())]
-    values = [np.concatenate([ex.series(e, run, np.atleast_1d(run["t"])) for run in runs]) for e in read]
+    values = [_values(e, runs) for e in read]
     with np.errstate(all="ignore"):
         alike = np.corrcoef(values)[0, 1:] ** 2
     return bool(np.any(alike > FOLLOWS))
@@ -232,6 +261,11 @@ def _daily(clock: str, unit: str | None, runs: Sequence[Values]) -> Signal | Non
     day = conversion("day", unit)[0]
     hours = np.floor(24 * np.concatenate([np.atleast_1d(run[clock]) for run in runs]) / day) % 24
     return Signal(clock, name(clock), unit, day, daily=True) if len(np.unique(hours)) == 24 else None
+
+
+def _values(e: Expr, runs: Sequence[Values]) -> np.ndarray:
+    """Return the values of an expression along all runs, one after another."""
+    return np.concatenate([ex.series(e, run, np.atleast_1d(run["t"])) for run in runs])
 
 
 def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
