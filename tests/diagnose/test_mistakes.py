@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from tests.checks.rigs import PLANTS, rig
@@ -15,6 +16,7 @@ from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.mistakes import MISTAKES
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 BLOCK = "one block"
 
@@ -79,3 +81,77 @@ def test_a_link_of_the_wrong_sign_is_found_before_a_refit():
     found = checks(wrong, [table])
     assert [(f.kind, f.severe) for f in found] == [("sign", True)]
     assert "'between'" in found[0].what and "wrong.yaml:" in found[0].suggestion
+
+
+DECAY = """
+format: thermoctl-plant/1
+title: A level that falls with a power of itself
+inputs: {u: {between_samples: hold}}
+parameters: {k: {value: 0.5, range: [0.05, 5]}}
+nodes: {x: {storage: 1, initial: first(x_m), initial_sigma: 0.05}}
+flows:
+  drive: {into: x, rate: u}
+  loss: {from: x, rate: k * x**3}
+outputs: {x_m: {value: x, noise: 0.01}}
+"""
+
+
+@pytest.mark.parametrize("true", [3, 5])
+def test_a_wrong_exponent_is_named_as_such(true):
+    """Both odd: the flow keeps its sign where the state is below zero."""
+    t, random = np.arange(0, 100, 0.5), np.random.default_rng(3)
+    u, x = np.repeat(random.uniform(-1.5, 2, 10), 20), np.zeros(len(t))
+    for k in range(1, len(t)):
+        # Heun's method in small steps, independent of the product
+        x[k] = x[k - 1]
+        for _ in range(100):
+            first = u[k - 1] - 0.8 * x[k] ** true
+            x[k] += 0.005 * 0.5 * (first + u[k - 1] - 0.8 * (x[k] + 0.005 * first) ** true)
+    table = Table("run", "", t, {"u": u, "x_m": x + random.normal(0, 0.01, len(t))})
+    found = contract(diagnose(loads(DECAY), [table], catalogue((CATALOGUE,)), limits()))
+    names = [(f["effect"], f["where"]) for f in found["findings"]]
+    assert names == ([] if true == 3 else [("wrong_exponent", "loss")])
+    if names:
+        (value,) = found["findings"][0]["parameters"].values()
+        assert value["value"] == pytest.approx(true, abs=0.1)
+
+
+def test_a_weir_where_the_plant_has_a_pipe():
+    """A notch lets out h**2.5; the largest exponent of an outlet had been 1."""
+    weir = """
+format: thermoctl-plant/1
+title: A basin with an overfall
+inputs: {inflow: {unit: m**3/s, between_samples: hold}}
+parameters:
+  area: {value: 12, unit: m**2}
+  c: {value: 2, range: [0.1, 30]}
+nodes: {h: {unit: m, storage: area, initial: first(gauge), initial_sigma: 0.01}}
+flows:
+  fill: {into: h, rate: inflow}
+  over: {from: h, rate: c * h}
+outputs: {gauge: {value: h, unit: m, noise: 0.004}}
+"""
+    t = np.arange(0, 400.0, 2)
+    inflow = np.repeat(np.random.default_rng(8).uniform(0.1, 2.5, 10), 20)
+    truth = compile_plant(loads(weir.replace("value: 2,", "value: 1.9,").replace("c * h}", "c * h**2.5}")))
+    table = truth.measure(Table("run", "", t, {"inflow": inflow, "gauge": np.full(len(t), 0.8)}), 8)
+    found = contract(diagnose(loads(weir), [table], catalogue((CATALOGUE,)), limits()))
+    (finding,) = found["findings"]
+    assert (finding["effect"], finding["where"]) == ("orifice_exponent", "over")
+    (value,) = finding["parameters"].values()
+    assert value["value"] == pytest.approx(2.5, abs=0.05)
+
+
+def test_a_parameter_that_ends_at_a_bound_is_noted():
+    """What is found may stand for a value beyond the bound. A bound of zero is no news: the flow is not there."""
+    t = np.arange(0, 100.0, 0.5)
+    u = np.repeat(np.random.default_rng(4).uniform(-1.5, 2, 10), 20)
+    truth = compile_plant(loads(DECAY.replace("0.5, range", "0.8, range")))
+    table = truth.measure(Table("run", "", t, {"u": u, "x_m": np.zeros(len(t))}), 4)
+
+    def notes(low):
+        plant = loads(DECAY.replace("0.5, range: [0.05, 5]", f"2, range: [{low}, 5]"))
+        return contract(diagnose(plant, [table], {}, limits()))["notes"]
+
+    assert any(n.startswith("k (1) ends at the bound of its range") for n in notes(1))
+    assert not any("bound" in n for n in notes(0.05))

@@ -208,6 +208,7 @@ EMPTY = Table("run", "run", np.arange(200.0), {"inflow": np.zeros(200), "gauge":
         ("k * level / 2", 1.0),
         ("k * sqrt(max(level, 0))", 0.5),
         ("k * max(level, 0)**0.8", 0.8),
+        ("k * max(level, 0)**1.5", 1.5),
     ],
 )
 def test_an_outlet_has_the_exponent_of_its_file_until_another_is_found(rate, exponent):
@@ -249,5 +250,5 @@ def test_only_a_level_has_an_outlet_and_only_of_its_own_head(motor):
     two = TANK.replace("RATE", "k").replace("0.3}}", "0.3}, lower: {unit: m, storage: 1, initial: 0}}")
     plant = loads(two.replace("outputs:", f"{drains}\noutputs:"))
     assert offered(plant, EMPTY, "orifice_exponent") == {}
-    weir = loads(TANK.replace("RATE", "k * max(level, 0)**1.5"))  # no orifice
-    assert offered(weir, EMPTY, "orifice_exponent") == {}
+    steep = loads(TANK.replace("RATE", "k * max(level, 0)**3"))  # neither an orifice nor a weir
+    assert offered(steep, EMPTY, "orifice_exponent") == {}

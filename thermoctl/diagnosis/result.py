@@ -241,6 +241,7 @@ def _notes(d: Diagnosis) -> list[str]:
         *doubts(d.case, d.final.fit, d.before.noise),
         *late(d.case, d.final),
         *unfinished(d.null, d.final),
+        *_at_bounds(d),
         *_differ(d),
         *(note for law in d.laws for note in wrong_ends(d.case, law)),
         *(
@@ -276,6 +277,27 @@ def _differ(d: Diagnosis) -> list[str]:
     return [
         f"the error of {worst} is {over[worst]:.2g} times the noise in {listed(d.worth.names)}, set aside: {why}"
     ]
+
+
+def _at_bounds(d: Diagnosis) -> list[str]:
+    """Return a sentence where values end at bounds that the plant file may have set too narrow.
+
+    A bound of zero is physics: a flow that is not there."""
+    known, ends = d.case.plant.parameters, list[str]()
+    for q, side in d.final.fit.at_bound.items():
+        low, high = (known[q].range if q in known else None) or (0.0, 0.0)
+        bound = low if side == "low" else high
+        if bound:
+            ends.append(f"{q} ({bound:g})")
+    one = len(ends) == 1
+    return (
+        [
+            f"{listed(ends)} {'ends at the bound of its range' if one else 'end at bounds of their ranges'}: the "
+            f"truth may lie beyond, and what was found may stand for that; widen the {'range' if one else 'ranges'} if physics allows it"
+        ]
+        if ends
+        else []
+    )
 
 
 def unfinished(*fits: Fitted) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.hypothesis.effect import UNITS_OF, Effect, EffectParameter
-from thermoctl.diagnosis.hypothesis.places import ERRORS, Place, heats, outlet
+from thermoctl.diagnosis.hypothesis.places import ERRORS, Place, heats, outlet, power
 from thermoctl.diagnosis.hypothesis.rig import STRAIGHT, TEMPERATURE, Rig, kind_of, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -21,6 +21,8 @@ from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 
 _form = cache(ex.parse)  # each expression of the catalogue is parsed once
 LONGEST = 78  # characters of a node's name
+
+TINY = 1e-9  # least size of a state that is raised to a power below zero
 
 
 @dataclass
@@ -355,11 +357,18 @@ class _Builder:
         self._new_flow(f"spill_{a}_out", over, a, None, unit)
 
     def _exponent(self, parameter: str) -> None:
-        f = self._changed_flow
-        parts = outlet(self.rig, f)
-        assert parts is not None  # the place is an outlet
-        part, head, _ = parts
-        new = ex.make("**", head, name(self.c.own(parameter)))
+        """Change the exponent n of a power, or of an outlet's head.
+
+        x**n abs(x)**(N - n) has the sign of x**n."""
+        f, own = self._changed_flow, name(self.c.own(parameter))
+        if found := power(self.rig, f):
+            part, n = found
+            size = ex.make("max", ex.make("abs", part.args[0]), ex.num(TINY))
+            new = ex.mul(part, ex.make("**", size, ex.add(own, ex.num(-n))))
+        else:
+            parts = outlet(self.rig, f)
+            assert parts is not None  # the place is a power or an outlet
+            part, new = parts[0], ex.make("**", parts[1], own)
         rate = ex.substitute(f.rate, lambda e: new if e is part else None)
         self.flows[f.name] = dataclasses.replace(f, rate=rate, unit=None)
 

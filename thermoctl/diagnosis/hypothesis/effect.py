@@ -48,6 +48,7 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "resistive": (),
     "fixed_node": ("T",),
     "fixed_flow": (),
+    "power": (),
 }
 """The symbols of each place that an effect's expressions may read; its nodes are also ends of flows."""
 EVERYWHERE = ("air", "reference", "duration", "sample", "t")

@@ -12,6 +12,8 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name
 from thermoctl.plant.language import Flow, Plant
 
+WEIR = 2.6  # largest exponent of an outlet: 5/2 for a notch
+
 
 @dataclass(frozen=True)
 class Place:
@@ -201,9 +203,14 @@ def _voltages(rig: Rig) -> Iterator[Place]:
 
 
 def _circuits(rig: Rig) -> Iterator[Place]:
-    """Yield where a voltage can be added: outputs that are voltages, and nodes that are currents."""
+    """Yield where a voltage acts: outputs that are voltages or follow from one, nodes that are currents."""
     yield from _voltages(rig)
     yield from _nodes(rig.currents, "a")
+    physics = rig.physics
+    volts = {i.name for i in physics.inputs.values() if rig.kind(i) == "voltage"}
+    for o in physics.outputs.values():
+        if rig.kind(o) == "current" and ex.names(o.value) & (volts | _ohms(rig)):
+            yield Place(o.name, {"y": o.value}, output=o.name)
 
 
 def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
@@ -229,6 +236,22 @@ def outlet(rig: Rig, f: Flow) -> tuple[Expr, Expr, float] | None:
     return head, head if head.op == "max" else ex.make("max", head, ex.num(0.0)), 1.0
 
 
+def power(rig: Rig, f: Flow) -> tuple[Expr, float] | None:
+    """Return the only power of states in a flow, and its exponent, if no range frees it.
+
+    Up to that of a weir, the exponent of an outlet is physics (`orifice_exponent`)."""
+    values = {p.name: p.value for p in rig.physics.parameters.values()}
+    states = rig.physics.nodes.keys()
+    found = {e for e in ex.walk(f.rate) if e.op == "**" and ex.names(e.args[0]) & states}
+    if len(found) != 1:
+        return None
+    (e,) = found
+    if not ex.names(e.args[1]) <= values.keys() or _free(rig, e.args[1]):
+        return None
+    exponent = float(ex.evaluate(e.args[1], values))
+    return None if exponent <= WEIR and outlet(rig, f) else (e, exponent)
+
+
 def _sources(rig: Rig, node: str) -> bool:
     return any(f.source == node and outlet(rig, f) for f in rig.physics.flows.values())
 
@@ -246,8 +269,19 @@ def _orifices(rig: Rig) -> Iterator[Place]:
             yield Place(f.name, flow=f.name, exponent=parts[2])
 
 
+def _powers(rig: Rig) -> Iterator[Place]:
+    for f in rig.physics.flows.values():
+        if parts := power(rig, f):
+            yield Place(f.name, flow=f.name, exponent=parts[1])
+
+
+def _ohms(rig: Rig) -> set[str]:
+    """Return the parameters that are resistances."""
+    return {q for q, p in rig.physics.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
+
+
 def _resistive(rig: Rig) -> Iterator[Place]:
-    ohms = {q for q, p in rig.physics.parameters.items() if p.unit and re.search(r"ohm", p.unit, re.I)}
+    ohms = _ohms(rig)
     for o in rig.physics.outputs.values():
         if ex.names(o.value) & ohms:
             yield Place(o.name, {}, output=o.name)
@@ -306,4 +340,5 @@ PLACES = {
     "resistive": _resistive,
     "fixed_node": _fixed_nodes,
     "fixed_flow": _fixed_flows,
+    "power": _powers,
 }

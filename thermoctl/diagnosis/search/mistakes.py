@@ -1,10 +1,10 @@
 """Rivals of every effect: a number that the plant file fixes is off by a factor.
 
 A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
-mass. The entries of config/mistakes/ free one such number each. They are refitted and weighed like the
-hypotheses of the search. A refit starts at the best power of ten, because a storage that is far too small has
-no gradient at the factor 1. A reading whose first sample contradicts the plant's
-initial state may be off by a constant.
+mass. The entries of config/mistakes/ free one such number each: a factor, a constant, or an exponent. They
+are refitted and weighed like the hypotheses of the search. A factor starts at the best power of ten, because
+a storage that is far too small has no gradient at the factor 1. A reading whose first sample
+contradicts the plant's initial state may be off by a constant.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _start(case: Case, c: Candidate) -> tuple[float, Plant, Placed]:
     """Return (least cost of the trial values, the plant with the best one, the factor as placed)."""
     (p,) = c.effect.parameters
     off = case.off.get(c.place.output or "")
-    tried = DECADES if off is None else (off,)
+    tried = (off,) if off is not None else (p.null,) if p.origin == "exponent" else DECADES
     span = {p.name: (p.low, p.high) if off is None else (-WIDE * abs(off), WIDE * abs(off))}
     own = c.own(p.name)
     placed = Placed(c, {p.name: own})
