@@ -98,3 +98,29 @@ def test_a_loss_that_halves_while_the_plants_own_loss_imitates_it_is_found_at_it
     for name, true in (("A_conductance_step_loss_2", -0.5), ("T0_conductance_step_loss_2", 300.0)):
         value, sd = values[name]
         assert abs(value - true) < 3 * sd
+
+
+LEAKY = """
+format: thermoctl-plant/1
+title: Tank
+inputs: {pump: {between_samples: hold}}
+parameters: {leak: {value: 0.01, range: [0.001, 0.1]}}
+nodes: {level: {storage: 1, initial: 0}}
+flows:
+  in: {into: level, rate: pump}
+  out: {from: level, rate: leak * level}
+outputs: {gauge: {value: level, noise: 0.01}}
+"""
+
+
+@pytest.mark.parametrize("steep", ["at the end", "after a switch"])
+def test_what_a_plant_does_not_follow_is_no_outlier(steep):
+    """The last row of a steep error, and the rows that answer a switch, were left out."""
+    t = np.arange(600.0)
+    pump = 1.0 * (t % 300 < 150)
+    truth = compile_plant(loads(LEAKY))
+    table = truth.measure(Table("run", "", t, {"pump": pump}), 1)
+    late = 0.5 * np.exp(-(t % 150) / 2) * (t >= 150)
+    table.columns["gauge"] += 1e-12 * np.exp(t / 20) if steep == "at the end" else late
+    kept = case(loads(LEAKY), [table], catalogue(), Budget(80))
+    assert np.isfinite(kept.tables[0].columns["gauge"]).all()

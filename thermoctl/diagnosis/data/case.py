@@ -321,13 +321,25 @@ def _without_outliers(
             away = e[index, j] - _median_of_five(e[index, j])
             limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
-            odd = index[(np.abs(away) > limit) & ~predicted]
-            if len(odd) and len(odd) < 0.02 * len(index):
+            far = (np.abs(away) > limit) & ~predicted
+            odd = index[far & _lonely(e[index, j])]
+            if len(odd) and far.sum() < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan
                 dropped.append((t.name, o.column, tuple(float(at) for at in t.t[odd] - t.t[0])))
         out.append(dataclasses.replace(t, columns=columns))
     return out, tuple(dropped)
+
+
+def _lonely(e: np.ndarray) -> np.ndarray:
+    """Return which values are farther from both neighbours than these are from each other.
+
+    An answer to a step lasts longer than a row. Before the first value the rig may have been anywhere, so its
+    neighbours are the next two. Beyond the last value the line through the two before it goes on."""
+    before, after = np.roll(e, 1), np.roll(e, -1)
+    before[0], after[-1] = e[2], 3 * e[-2] - 2 * e[-3]
+    away = np.minimum(np.abs(e - before), np.abs(e - after))
+    return np.asarray(np.abs(before - after) < away)
 
 
 def _median_of_five(e: np.ndarray) -> np.ndarray:
