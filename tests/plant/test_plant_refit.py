@@ -12,7 +12,7 @@ from thermoctl.plant.fitting.estimate import report
 from thermoctl.plant.fitting.noise import coloured, innovations
 from thermoctl.plant.fitting.refit import fit, fit_by_first_parts
 from thermoctl.plant.fitting.residuals import Prior, Problem
-from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 
@@ -248,3 +248,33 @@ def test_readings_that_begin_late_are_fitted_all_the_same():
     model = compile_plant(plant(noise="noise: 0.02"))
     drives = [model.excitation(table)]
     assert fit_by_first_parts(model, drives).cost == pytest.approx(fit(model, drives).cost)
+
+
+FISHERY = """
+format: thermoctl-plant/1
+title: A stock with its catch
+inputs: {catch: {between_samples: hold}}
+parameters:
+  r: {value: 0.12, range: [0.02, 0.6]}
+  K: {value: 600, range: [200, 2000]}
+nodes: {N: {storage: 1, initial: first(count), initial_sigma: 25}}
+flows:
+  growth: {into: N, rate: r * N * log(K / N)}
+  fishing: {from: N, rate: catch}
+outputs: {count: {value: N, noise: 8}}
+"""
+
+
+def test_a_stock_that_the_files_values_use_up_before_the_end_is_fitted():
+    """The free run ended at the logarithm of a negative number: the recording was refused."""
+    t = np.arange(0.0, 60.0)
+    catch = np.full(len(t), 34.0)
+    truth = compile_plant(loads(FISHERY.replace("0.12", "0.2").replace("600", "500")))
+    table = truth.measure(Table("run", "", t, {"catch": catch, "count": np.full(len(t), 400.0)}), 6)
+    model = compile_plant(loads(FISHERY))
+    drives = [model.excitation(table)]
+    with pytest.raises(SimulationError):
+        fit(model, drives)
+    found = fit_by_first_parts(model, drives)
+    assert found.rms()["count"] < 9.5
+    assert found.parameters() == pytest.approx({"r": 0.2, "K": 500}, rel=0.1)

@@ -150,11 +150,17 @@ def fit_by_first_parts(
     """Fit as `fit` does; where a misfit stays, a second time from fits of the recordings' first parts.
 
     A rig that oscillates has a wrong optimum for each period that a free run gains or loses. A first
-    part is too short for that. Raises as `fit` does."""
-    first = fit(model, excitations, noise, start, tolerance=tolerance, tries=tries, seconds=seconds)
-    over = [first.rms()[o] / n.sigma for o, n in zip(model.outputs, first.noise, strict=True)]
-    if not any(ratio > MISFIT for ratio in over):  # an output that was not measured has NaN
-        return first
+    part is too short for that. So it may be for a stock that the file's values use up before the end, which
+    ends a free run. Raises as `fit` does."""
+    first: Fit | SimulationError
+    try:
+        first = fit(model, excitations, noise, start, tolerance=tolerance, tries=tries, seconds=seconds)
+    except SimulationError as e:
+        first = e
+    if isinstance(first, Fit):
+        over = [first.rms()[o] / n.sigma for o, n in zip(model.outputs, first.noise, strict=True)]
+        if not any(ratio > MISFIT for ratio in over):  # an output that was not measured has NaN
+            return first
     try:
         z = start
         for share in FIRST_PARTS:
@@ -162,8 +168,10 @@ def fit_by_first_parts(
             z = fit(model, some, noise, z, tolerance=tolerance, seconds=seconds).z
         second = fit(model, excitations, noise, z, tolerance=tolerance, seconds=seconds)
     except (SimulationError, InputError):  # a first part may hold no reading at all
-        return first
-    return second if second.cost < LESS * first.cost else first
+        if isinstance(first, Fit):
+            return first
+        raise first from None
+    return first if isinstance(first, Fit) and second.cost >= LESS * first.cost else second
 
 
 def _random_starts(problem: Problem, z0: np.ndarray, tries: int, seed: int) -> list[np.ndarray]:
