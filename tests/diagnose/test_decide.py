@@ -149,3 +149,7 @@ def test_a_misfit_in_one_reading_hides_no_effect_in_another():
     assert (
         physics(dataclasses.replace(beside, squares=(10.0, 1.0001)), beside, 0.1) < 0.5
     )  # two squares of noise
+    both = Energy(
+        (1e4, 2.5), (1e4, 1.5), (20_000.0, 20_000.0)
+    )  # a current's 1.5 beside the position's 10 000
+    assert physics(dataclasses.replace(both, squares=(1e4, 100.0)), both, 0.1) > 0.99

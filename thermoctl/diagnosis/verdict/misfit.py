@@ -2,12 +2,12 @@
 
 Every plant is also wrong in small ways, and these misfits have the shapes of effects. Their energy stays in
 the residuals of every hypothesis. Along each parameter of an effect, such a misfit has a normal distribution.
-Its variance is the share `alike` of that energy. One cause may act on several readings, so their energies are
-added. A reading o without a misfit determines the effect's size up to the noise of its n_o rows. The size of
-a true effect is log-uniform. With r, the effect's size in standard deviations of all readings together,
+Its variance is the share `alike` of that energy. One cause may act on all m readings with a misfit, so these
+count as one. A loud misfit of one does not hide an effect in another. The noise of its n rows limits a
+reading, too. The size of a true effect is log-uniform. With r, the effect's size in standard
+deviations of all readings together,
 
-    r^2 = (energy that the effect removes) / (share (energy that stays))  of readings with a misfit
-          + sum_o n_o (energy that it removes)                            of readings without one
+    r^2 = sum over readings (energy that the effect removes) / (share m (energy that stays) + 1 / n)
     share = 1 - (1 - alike)^parameters,   odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
 
 Energies are mean squares of an output's residuals over its sensor's noise.
@@ -121,9 +121,8 @@ def physics(without: Energy, beside: Energy, share: float) -> float:
     if not any(beside.misfit):
         return 1.0
     removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
-    evidence = max(float(removed[left > 0].sum()), 0.0) / (share * float(left.sum()))
-    evidence += float(removed[left == 0] @ np.array(beside.rows)[left == 0])
-    square = float(np.clip(evidence, 0.0, SURE))
+    variance = share * np.count_nonzero(left) * left + 1 / np.array(beside.rows)
+    square = float(np.clip((removed / variance).sum(), 0.0, SURE))
     r = max(np.sqrt(square), 1.0)
     odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
     return float(odds / (1 + odds))
