@@ -33,11 +33,14 @@ bench-law: develop                 # cost of a call of the law, by compiler
 # Tests that only compute share two cores; then those that run in real time have both to themselves.
 COMPUTED := $(addprefix tests/,advice api calibration checks concealed control diagnose disk export fleet fuzz identify laws \
 	people/test_extras.py plant proof recording reproduction rigs truth tune walkthrough) $(wildcard tests/test_*.py)
+# Tests of whole programs, which wait most of their time. What is left keeps times of milliseconds, so it runs alone.
+PROGRAMS := $(addprefix tests/,daemon devices hazards people)
 # Property tests repeat the same examples (Hypothesis profile ci): a clean checkout that passes, passes again.
 EXAMPLES ?= ci
 test: develop lint                 # lint and all quick tests; EXAMPLES=default draws new examples of the properties
 	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) -n 2 $(COMPUTED)
-	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) $(addprefix --ignore=,$(COMPUTED)) tests
+	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) -n 2 --dist loadfile $(addprefix --ignore=,$(COMPUTED)) $(PROGRAMS)
+	$(BIN)/python -m pytest -m "not slow" --hypothesis-profile=$(EXAMPLES) $(addprefix --ignore=,$(COMPUTED) $(PROGRAMS)) tests
 
 PROOF ?= build/proof
 SEED ?= 7
@@ -193,6 +196,9 @@ fmu-back: develop                  # ten plants with a hidden effect, diagnosed 
 	$(BIN)/python -m tests.plant.fmu_back
 
 .PHONY: test-resolve
+test-diagnosis: develop            # tests of the diagnosis and of the paper's method that take a minute or more each
+	$(BIN)/python -m pytest -m slow -n 2 tests/diagnose tests/laws tests/plant/test_strangers.py tests/proof tests/reproduction
+
 test-resolve: develop              # two equally good effects, separated by the proposed experiment
 	$(BIN)/python -m pytest -m slow tests/diagnose/test_next_experiment.py
 

@@ -430,6 +430,7 @@ def test_a_pump_that_is_clipped_is_the_actuators_entry(tmp_path):
     assert u["value"] == pytest.approx(3.1, abs=0.03)
 
 
+@pytest.mark.slow
 def test_physics_outside_the_catalogue_leaves_a_remainder_at_its_place(tmp_path):
     def boiling(t, x, a):
         return (-1.2 * np.sin(t / 9.0) ** 2 * (x[0] > 45), 0.0)
@@ -443,6 +444,7 @@ def test_physics_outside_the_catalogue_leaves_a_remainder_at_its_place(tmp_path)
     assert 0.2 < m["missing_flow_rms"] < 0.45, m
 
 
+@pytest.mark.slow
 def test_a_change_of_phase_is_unknown_and_sits_in_the_storage(tmp_path):
     """The first block melts round 40 degC, in 0.8 K: no entry says that."""
     r = diagnosed(
@@ -453,6 +455,7 @@ def test_a_change_of_phase_is_unknown_and_sits_in_the_storage(tmp_path):
     assert (law["part"], law["into"], law["of"]) == ("storage", "one", ["one"]) and law["confirmed"] > 0.9
 
 
+@pytest.mark.slow
 def test_a_resonance_is_unknown_and_sits_between_drive_and_carriage(tmp_path):
     """A second mass on a spring on a carriage that runs against a damper: no entry says that."""
     (tmp_path / "plant.yaml").write_text("""
@@ -557,6 +560,7 @@ def _rewritten(path, change):
     write(path, ",".join(names), rows, "%.7g")
 
 
+@pytest.mark.slow
 def test_a_channel_whose_clock_runs_ahead_is_no_physics_of_the_catalogue(tmp_path):
     paths = heater(tmp_path, seeds=(1,))
 

@@ -25,11 +25,17 @@ from tests.proof.score import meant
     ("case", "effects", "changes"),
     [
         (("tanks", 1, "one", "open"), [["sensor_delay", "level_lower"]], [together(order, clock, names)]),
-        (("drive", 1, "one", "open"), [["copper_resistance", "joule"]], [together(kelvin, milliwatt)]),
-        (
+        pytest.param(
+            ("drive", 1, "one", "open"),
+            [["copper_resistance", "joule"]],
+            [together(kelvin, milliwatt)],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
             ("heater", 2, "none", "closed"),
             [],
             [together(rows_lost, cells_lost), columns_added, thinned, noise_stated(0.5), noise_stated(2.0)],
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["order, clock and names", "units", "losses, unrelated columns, thinning and the stated noise"],

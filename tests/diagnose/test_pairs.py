@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.plants import TWO_BLOCKS
 from thermoctl.diagnosis.diagnose import diagnose
@@ -26,6 +27,7 @@ TRUTH = (
 )
 
 
+@pytest.mark.slow
 def test_a_split_of_heat_that_a_gain_cancels_is_found_with_it():
     """Alone neither pays for its odds, and no pair of such effects was tried: the verdict was `consistent`."""
     t = np.arange(1500) * 4.0

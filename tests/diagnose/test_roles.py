@@ -123,7 +123,7 @@ def test_the_air_stays_the_ambient_beside_every_effect(between):
     rig = blocks()
     rig.plant["inputs"]["air"]["between_samples"] = between
     _, structure, table = _read(rig)
-    for c in candidates(structure, catalogue()):
+    for c in {c.effect.name: c for c in candidates(structure, catalogue())}.values():
         plant = c.extend({})
         beside = Rig(plant, [compile_plant(plant).excitation(table)], [dict(table.columns)])
         assert beside.air == structure.air == "air", c.key

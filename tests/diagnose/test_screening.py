@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pytest
 
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from thermoctl.diagnosis.data.case import Budget, case
@@ -46,6 +47,7 @@ def test_a_remainder_does_not_hide_a_slow_effect_from_the_screening():
     assert promise(looked, "sensor_offset_step", "temperature_1") > 20
 
 
+@pytest.mark.slow
 def test_an_error_that_repeats_quickly_in_time_is_seen_whatever_its_number_of_periods():
     """Its 30 periods of the scale pass within a block of samples: their rows are above those of the screening."""
     t = np.arange(48_000) * 0.001

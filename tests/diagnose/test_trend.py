@@ -23,6 +23,7 @@ def test_a_line_through_sizes():
     assert np.isinf(line([0, 0, 0], [(1.0, 0.1)] * 3)[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("growth", [0.0, 1e-11], ids=["constant", "grows"])
 def test_an_effect_that_grows_has_a_trend(tmp_path, growth):
     """Radiation, whose factor grows from week to week; four recordings of 400 s."""

@@ -478,6 +478,7 @@ def test_smoke_set_is_diagnosed_and_scored(tmp_path):
     assert prove(tmp_path / "cases", tmp_path / "out", tmp_path / "answers")["rows"] == content["rows"]
 
 
+@pytest.mark.slow
 def test_bench_counts_a_peer_by_the_same_scoring(tmp_path, capsys):
     """A peer on two cases with nothing missing: what it says is scored, kept, and not computed again."""
     import importlib.util

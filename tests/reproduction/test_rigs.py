@@ -101,6 +101,7 @@ def proof():
     return rig, run4, r4, paper.calibrate(r2, r3, r4a)
 
 
+@pytest.mark.slow
 def test_the_better_method_beats_the_papers_and_the_coil_alone(proof):
     rig, run4, r4, c = proof
     left = {k: iso230.mean_and_two_s((r4.true_um - v)[7200:])[1] for k, v in paper.estimates(c, r4).items()}
@@ -109,6 +110,7 @@ def test_the_better_method_beats_the_papers_and_the_coil_alone(proof):
     assert bound < left["better"] < 6 * bound
 
 
+@pytest.mark.slow
 def test_compensators_for_the_daemon_follow_the_estimators(proof):
     """The law's form at 0.1 s, stepped plainly, gives what the filter at 1 s gives."""
     _, _, r4, c = proof
