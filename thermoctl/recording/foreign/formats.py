@@ -27,12 +27,13 @@ from thermoctl.recording.files import own_meta
 from thermoctl.recording.foreign.clock import Seconds
 from thermoctl.recording.foreign.dialect import distinct
 from thermoctl.recording.foreign.facts import stated_step
-from thermoctl.recording.foreign.modelica import trajectories
 from thermoctl.recording.foreign.sheet import Cells, Sheet, as_cells, place_in
 from thermoctl.recording.foreign.units import spelled
 from thermoctl.recording.stream import texts
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import units
+
+_MODELICA_UNIT = re.compile(r"\[([^\]|]+)[^\]]*\]\s*$")  # `Angle [rad|deg]`
 
 
 def _damaged(path: Path, kind: str, e: Exception) -> InputError:
@@ -221,7 +222,7 @@ def _loaded(path: Path) -> dict[str, Any]:
 def read_mat(path: Path, notes: list[str], variable: str | None = None) -> list[Sheet]:
     """Read a MATLAB file, 4 to 7.3: tables, timetables, structs, vectors. Raises InputError."""
     content = _loaded(path)
-    if (result := trajectories(content, notes)) is not None:
+    if (result := _trajectories(content, notes)) is not None:
         return [Sheet(result[0], place_in(path), result[1])]
     step_s = _stated(content)
     if variable is not None:
@@ -319,6 +320,42 @@ def _vectors(value: Any) -> dict[str, np.ndarray]:
     for k, signal in enumerate(signals, 1):
         vectors["".join(np.ravel(signal["label"])) or f"signal_{k}"] = np.squeeze(signal["values"])
     return vectors
+
+
+def _trajectories(
+    content: Mapping[str, Any], notes: list[str]
+) -> tuple[dict[str, Cells], dict[str, str]] | None:
+    """Return the varying columns of a result of Dymola or OpenModelica, and their units; else None.
+
+    Of the rows of an event, which have one time, the last is kept."""
+    kind = [str(line).strip("\0 ") for line in np.ravel(content.get("Aclass", []))]
+    if not kind or kind[0] != "Atrajectory":
+        return None
+    by_column = "binTrans" in kind
+    if "data_2" in content:
+        matrices = (content[k].T if by_column else content[k] for k in ("dataInfo", "data_2"))
+        places, data = (np.asarray(m) for m in matrices)
+        names, meanings = (_lines(content.get(k, []), by_column) for k in ("name", "description"))
+    else:
+        data, names = np.asarray(content["data"]), _lines(content.get("names", []), by_column)
+        places, meanings = np.array([(2, k + 1) for k in range(len(names))]), [""] * len(names)
+    last = np.append(np.diff(data[:, 0]) != 0, True)
+    if not last.all():
+        notes.append(f"{np.sum(~last)} rows before an event, or twice, left out")
+    columns: dict[str, Cells] = {}
+    units = {}
+    for name, meaning, (table, column, *_) in zip(names, meanings, places.astype(int), strict=False):
+        if table != 1:  # the table of parameters, which are constant
+            columns[name] = np.sign(column) * data[last, abs(column) - 1].astype(float)
+            if match := _MODELICA_UNIT.search(meaning):
+                units[name] = spelled(match[1], name) or ""
+    return columns, {n: u for n, u in units.items() if u}
+
+
+def _lines(text: Any, by_column: bool) -> list[str]:
+    """Return the lines of a matrix of letters; `by_column`: it is stored transposed."""
+    lines = [str(line) for line in np.ravel(text)]
+    return ["".join(letters).rstrip("\0 ") for letters in (zip(*lines, strict=True) if by_column else lines)]
 
 
 def read_arrow(path: Path, arrow: pa.Table) -> Sheet:

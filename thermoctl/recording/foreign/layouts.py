@@ -5,9 +5,8 @@ Each reader returns sheets of texts, or None where the text is of another kind.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,10 @@ import pyarrow.compute as pc
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.dialect import cells_of
-from thermoctl.recording.foreign.sheet import Sheet, place_in
+from thermoctl.recording.foreign.jsonfile import IDS, read_json
+from thermoctl.recording.foreign.sheet import Sheet, of_lists, of_records
 from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled, states_unit_of
 
-IDS = WORDS["identities"].split()
 VALUES = WORDS["values"].split()
 _BOOKKEEPING = {"result", "table", "_start", "_stop", "_measurement"}
 _POINT = re.compile(
@@ -33,7 +32,6 @@ _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
-MOST_ITEMS = 64  # largest number of items of a list that is one sample, such as an acceleration
 LEAD = 65536  # number of first bytes from which the layout is found
 _GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
 
@@ -45,188 +43,6 @@ def special(path: Path, text: bytes) -> list[Sheet] | None:
         if looks.search(lead) and (sheets := reader(path, text.decode("utf-8"))) is not None:
             return sheets
     return None
-
-
-def _sheet(
-    path: Path, columns: Mapping[str, Sequence[Any]], place: Callable[[int], str], name: str = ""
-) -> Sheet:
-    texts = {n: pa.array(["" if v is None else _word(v) for v in c], pa.string()) for n, c in columns.items()}
-    return Sheet(dict(texts), place, name=name)
-
-
-def _word(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _records(path: Path, records: Sequence[Mapping[str, Any]]) -> Sheet:
-    records = [_flat(r) for r in records]
-    names = list(dict.fromkeys(k for r in records for k in r))
-    columns = {n: [r.get(n) for r in records] for n in names}
-    return _sheet(path, columns, place_in(path, "record"))
-
-
-def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record's values; those inside a value are called `outer_inner`, or `outer_1` in a list."""
-    values: dict[str, Any] = {}
-    for key, value in record.items():
-        if isinstance(value, dict):
-            values |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
-        elif not isinstance(value, list):
-            values[key] = value
-        elif len(value) <= MOST_ITEMS and all(isinstance(v, int | float) for v in value):
-            values |= {f"{key}_{i}": v for i, v in enumerate(value, 1)}
-    return values
-
-
-def _json(path: Path, text: str) -> list[Sheet] | None:
-    notes: list[str] = []
-    try:
-        content = json.loads(text)
-    except ValueError as e:
-        content = _json_lines(path, text, notes)
-        if not content:
-            if path.suffix.lower() == ".json":
-                raise InputError(f"{path}: no JSON: {e}") from None
-            return None
-    if sheets := _of_json(path, content):
-        sheets[0].notes += notes
-        return sheets
-    raise InputError(
-        f'{path}: no table in this JSON; records [{{"t": 0, "T": 20}}, ...], columns {{"t": [0, 1], "T": [20, 21]}} '
-        'or rows [["t", "T"], [0, 20], ...] were expected'
-    )
-
-
-def _json_lines(path: Path, text: str, notes: list[str]) -> list[Any]:
-    """Return the values of lines of JSON; none where the first line is none. A cut last line is a note."""
-    rows = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-    found: list[Any] = []
-    for number, line in rows:
-        try:
-            found.append(json.loads(line))
-        except ValueError as e:
-            if not found:
-                break
-            if number != rows[-1][0]:
-                raise InputError(f"{path}:{number}: no JSON: {e}; a line of JSON was expected") from None
-            notes.append(f"line {number} at the end left out: no whole JSON (was the file cut off?)")
-    return found
-
-
-def _of_json(path: Path, content: Any) -> list[Sheet] | None:
-    """Return the tables of a JSON value: records, columns, or lists of either."""
-    if isinstance(content, list):
-        return _of_list(path, content)
-    if not isinstance(content, dict):
-        return None
-    for reader in (_thingspeak, _series, _temperature_store):
-        if sheets := reader(path, content):
-            return sheets
-    if sheet := _lists(path, content):
-        return [sheet]
-    inner = [f for v in content.values() if isinstance(v, dict | list) and (f := _of_json(path, v))]
-    if not inner:
-        inner = [f for v in content.values() if isinstance(v, list) for x in v if (f := _of_json(path, x))]
-    return [s for f in inner for s in f] or None
-
-
-def _lists(path: Path, content: Mapping[str, Any]) -> Sheet | None:
-    """Return the lists of one length in an object as columns; the longest, if they are two or more."""
-    lists = {
-        k: v for k, v in content.items() if isinstance(v, list) and v and not isinstance(v[0], dict | list)
-    }
-    lengths = [len(v) for v in lists.values()]
-    rows = max((n for n in lengths if lengths.count(n) > 1), default=0)
-    if not rows:
-        return None
-    sheet = _sheet(path, {k: v for k, v in lists.items() if len(v) == rows}, place_in(path, "item"))
-    sheet.notes += [
-        f"list '{k}' left out: {len(v)} items; the others have {rows}"
-        for k, v in lists.items()
-        if len(v) != rows
-    ]
-    return sheet
-
-
-def _of_list(path: Path, content: list[Any]) -> list[Sheet] | None:
-    if content and all(isinstance(x, dict) for x in content):
-        if series := [s for x in content for s in _series(path, x) or ()]:
-            return series
-        if not any(named(k) > 0 for x in content for k in x):  # InfluxDB: results, each with its series
-            inner = [
-                f for x in content for v in x.values() if isinstance(v, list) and (f := _of_json(path, v))
-            ]
-            if inner:
-                return [s for f in inner for s in f]
-        tables = [s for x in content if (s := _lists(path, x))]
-        if len(tables) == 1 == len(content):
-            return tables
-        if len(tables) == len(content) and not any(
-            named(k) > 0 for x in content for k, v in x.items() if not isinstance(v, list)
-        ):
-            raise InputError(
-                f"{path}: {len(tables)} objects of lists; one was expected: write a file of each"
-            )
-        return [_records(path, content)]
-    lists = all(isinstance(x, list) and x and all(isinstance(y, dict) for y in x) for x in content)
-    if content and lists:  # Home Assistant: a list for each entity
-        return [_records(path, [{**_identity(x[0]), **y} for x in content for y in x])]
-    if len(content) > 1 and all(isinstance(x, list) for x in content):
-        rows = content[1:] if all(isinstance(n, str) for n in content[0]) else content
-        names = content[0] if rows is not content else [f"column_{i + 1}" for i in range(len(rows[0]))]
-        plain = not any(isinstance(y, dict | list) for x in rows for y in x)
-        if plain and {len(x) for x in rows} == {len(set(names))} != {1}:
-            return [
-                _sheet(path, dict(zip(names, zip(*rows, strict=True), strict=True)), place_in(path, "item"))
-            ]
-    return None
-
-
-def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
-    feeds, titles = content.get("feeds"), content.get("channel", {})
-    if not isinstance(feeds, list) or not feeds or not isinstance(titles, dict):
-        return None
-    names = {k: str(titles.get(k, k)) if k.startswith("field") else k for f in feeds for k in f}
-    return [_records(path, [{names[k]: v for k, v in f.items()} for f in feeds])]
-
-
-def _series(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
-    """Read columns and values of InfluxDB 1, columns and data of pandas, metric and values of Prometheus."""
-    values = content.get("values", content.get("data"))
-    if not isinstance(values, list) or not all(isinstance(v, list) for v in values):
-        return None
-    if isinstance(names := content.get("columns"), list):
-        names = ["_".join(map(str, n)) if isinstance(n, list) else str(n) for n in names]
-        index = content.get("index")
-        if isinstance(index, list) and len(index) == len(values) and not any(named(n) > 0 for n in names):
-            names, values = ["index", *names], [[i, *v] for i, v in zip(index, values, strict=True)]
-        return [_records(path, [dict(zip(names, v, strict=False)) for v in values])]
-    if isinstance(content.get("metric"), dict):
-        labels = content["metric"]
-        name = "_".join(str(v) for k, v in labels.items() if k not in ("job",)) or "value"
-        return [_records(path, [{"time": v[0], name: v[1]} for v in values])]
-    return None
-
-
-def _identity(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in record.items() if k in IDS}
-
-
-def _temperature_store(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
-    """Read Moonraker's temperature store: a list a second for each heater and sensor, the newest last."""
-    columns: dict[str, list[Any]] = {}
-    for name, held in content.items():
-        if isinstance(held, dict) and isinstance(held.get("temperatures"), list):
-            for key, unit in (("temperatures", "temperature"), ("targets", "target"), ("powers", "power")):
-                if isinstance(held.get(key), list):
-                    columns[f"{name}_{unit}"] = held[key]
-    if not columns:
-        return None
-    rows = min(len(c) for c in columns.values())
-    sheet = _sheet(path, {n: c[len(c) - rows :] for n, c in columns.items()}, place_in(path, "item"))
-    sheet.units = {n: "degC" for n in columns if not n.endswith("_power")}
-    sheet.step_s = 1.0
-    return [sheet]
 
 
 def _annotated(path: Path, text: str) -> list[Sheet] | None:
@@ -247,7 +63,7 @@ def _annotated(path: Path, text: str) -> list[Sheet] | None:
             records.append({h: c for h, c in zip(header, cells, strict=True) if h and h not in _BOOKKEEPING})
     if not records:
         raise InputError(f"{path}: no rows; at least one record was expected")
-    sheet = _records(path, records)
+    sheet = of_records(path, records)
     sheet.place = lambda row: f"{path}:{places[min(row, len(places) - 1)]}"
     return [sheet]
 
@@ -283,7 +99,7 @@ def _points(path: Path, text: str) -> list[Sheet] | None:
         tags = "_".join(part.partition("=")[2] for part in head.split(",")[1:]) or head
         named = {k if k == "time" or len(series) == 1 else f"{tags}_{k}": v for k, v in table.items()}
         numbers = places[head]
-        sheets.append(_sheet(path, named, lambda row, numbers=numbers: f"{path}:{numbers[row]}"))  # type: ignore[misc]
+        sheets.append(of_lists(path, named, lambda row, numbers=numbers: f"{path}:{numbers[row]}"))  # type: ignore[misc]
     return sheets
 
 
@@ -303,7 +119,7 @@ def _klipper(path: Path, text: str) -> list[Sheet] | None:
             elif sign and re.fullmatch(r"-?[\d.]+(?:e[+-]?\d+)?", value):
                 record[key if key in _GLOBAL or not section else f"{section}_{key}"] = value
         records.append(record)
-    sheet = _records(path, records)
+    sheet = of_records(path, records)
     sheet.units = {n: "degC" for n in sheet.columns if n.endswith(("_temp", "_target"))} | {"time [s]": "s"}
     sheet.place = lambda row: f"{path}:{text.count(chr(10), 0, lines[row].start()) + 1}"
     return [sheet]
@@ -318,7 +134,7 @@ def _labelled(path: Path, text: str) -> list[Sheet] | None:
             return None
         stamp = {"time": match["stamp"]} if match["stamp"] else {}
         records.append(stamp | dict(re.findall(_LABEL, match["labels"])))
-    return [_records(path, records)]
+    return [of_records(path, records)]
 
 
 def _tektronix(path: Path, text: str) -> list[Sheet] | None:
@@ -328,7 +144,7 @@ def _tektronix(path: Path, text: str) -> list[Sheet] | None:
         return None
     facts = {r[0].lower(): r[1] for r in rows if r[0]}
     name = facts.get("source", "CH1") or "CH1"
-    sheet = _sheet(
+    sheet = of_lists(
         path, {"TIME": [r[3] for r in rows], name: [r[4] for r in rows]}, lambda row: f"{path}:{row + 1}"
     )
     units = {"TIME": spelled(facts.get("horizontal units", "s")), name: spelled(facts.get("vertical units"))}
@@ -337,7 +153,7 @@ def _tektronix(path: Path, text: str) -> list[Sheet] | None:
 
 
 _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]], ...] = (
-    (re.compile(r"\A\s*[{\[]"), _json),
+    (re.compile(r"\A\s*[{\[]"), read_json),
     (re.compile(r"\A(?:#(?:datatype|group|default)\b|,result,table\b)"), _annotated),
     (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
@@ -359,7 +175,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     if ids is None:
         return None
     rest = {n: c for n, c in sheet.columns.items() if n not in (identity, value)}
-    times = {n: c for n, c in rest.items() if _is_clock(c) or (named(n) > 0 and isinstance(c, np.ndarray))}
+    times = {n: c for n, c in rest.items() if _is_clock(c) or (named(n) > 0 and _are_numbers(c))}
     tags = [
         n
         for n, c in rest.items()
@@ -379,6 +195,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
         rows = np.flatnonzero(pc.equal(ids, name).to_numpy(zero_copy_only=False))
         place = _places(sheet.place, rows)
         columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value], **units}.items()}
+        columns = {n: c for n, c in columns.items() if n not in units or pc.any(pc.not_equal(c, "")).as_py()}
         sheets.append(Sheet(columns, place, name=name, decimal=sheet.decimal))
     if sheets:
         sheets[0].notes += sheet.notes
@@ -387,7 +204,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
 
 def _of_one_day(cells: Any, notes: list[str]) -> Any:
     """Return times of day, which have no date, as durations from the first of all signals."""
-    if isinstance(cells, np.ndarray):
+    if isinstance(cells, np.ndarray) or not clock.are_times(cells):
         return cells
     seconds = clock.from_texts(cells)
     if seconds.kind != "time of day":
@@ -423,6 +240,10 @@ def _numbers(cells: Any) -> np.ndarray:
     if not len(cells) or not pc.all(pc.match_substring_regex(cells, r"^\d{1,9}$")).as_py():
         return np.zeros(0)
     return np.asarray(cells.cast(pa.float64()).to_numpy(zero_copy_only=False))
+
+
+def _are_numbers(cells: Any) -> bool:
+    return isinstance(cells, np.ndarray) or pc.all(pc.match_substring_regex(cells, r"^\d+\.?\d*$")).as_py()
 
 
 def _signals(name: str, cells: Any) -> pa.Array | None:

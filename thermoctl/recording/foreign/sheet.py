@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +14,8 @@ from thermoctl.recording.foreign.clock import Seconds
 
 Cells: TypeAlias = np.ndarray | pa.Array
 """A column: float64, datetime64 or timedelta64 values, or texts."""
+INDEX = " "  # name of an index without a name: a clock, or left out beside one
+MOST_ITEMS = 64  # largest number of items of a list that is one sample, such as an acceleration
 
 
 def place_in(path: Path, what: str = "row") -> Callable[[int], str]:
@@ -82,3 +84,40 @@ class Sheet:
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
+
+
+def of_lists(
+    path: Path,
+    columns: Mapping[str, Sequence[Any]],
+    place: Callable[[int], str] | None = None,
+    name: str = "",
+) -> Sheet:
+    """Return lists of one length as a sheet of texts."""
+    texts: dict[str, Cells] = {
+        n: pa.array(["" if v is None else _word(v) for v in c], pa.string()) for n, c in columns.items()
+    }
+    return Sheet(texts, place or place_in(path, "item"), name=name)
+
+
+def _word(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def of_records(path: Path, records: Sequence[Mapping[str, Any]], name: str = "") -> Sheet:
+    """Return records as a sheet of texts; a key that a record lacks is an empty cell."""
+    records = [_flat(r) for r in records]
+    names = list(dict.fromkeys(k for r in records for k in r))
+    return of_lists(path, {n: [r.get(n) for r in records] for n in names}, place_in(path, "record"), name)
+
+
+def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's values; those inside a value are called `outer_inner`, or `outer_1` in a list."""
+    values: dict[str, Any] = {}
+    for key, value in record.items():
+        if isinstance(value, dict):
+            values |= {f"{key}_{inner}": v for inner, v in _flat(value).items()}
+        elif not isinstance(value, list):
+            values[key] = value
+        elif len(value) <= MOST_ITEMS and all(isinstance(v, int | float) for v in value):
+            values |= {f"{key}_{i}": v for i, v in enumerate(value, 1)}
+    return values

@@ -180,7 +180,7 @@ def named(name: str) -> int:
 
 def states_unit_of(name: str, before: str) -> bool:
     """Return whether a column of texts is named as the unit of the one before it: Unit, `Main Unit`."""
-    words = set(tokens(name.replace("_of_measurement", "")))
+    words = set(tokens(re.sub("_of_measurement|^attributes_", "", name)))
     others = words - _UNIT_NAMES
     return named(before) <= 0 and others < words and others <= set(tokens(before))
 
