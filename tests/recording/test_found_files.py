@@ -667,3 +667,37 @@ def test_signals_named_by_instance_or_topic(tmp_path):
 def test_json_without_a_table(tmp_path, content, says):
     with pytest.raises(InputError, match=says):
         read(tmp_path, content, "run.json")
+
+
+@pytest.mark.parametrize(
+    "encoding, name, header",
+    [
+        ("gbk", "GBK", "时间,温度(℃),功率(W)"),
+        ("cp932", "Shift-JIS", "日時,温度(℃),電力(W)"),
+        ("cp949", "EUC-KR", "시간,온도(℃),전력(W)"),
+        ("big5", "Big5", "時間,溫度(℃),功率(W)"),
+        ("cp1251", "Windows-1251", "Время,Температура (°C),Мощность (W)"),
+        ("koi8-r", "KOI8-R", "Время,Температура (°C),Мощность (W)"),
+        ("cp1250", "Windows-1250", "Čas,Teplota (°C),Výkon (W)"),
+        ("cp1252", "Windows-1252", "Zeit,Kühlkörper (°C),Wärme (W)"),
+        ("cp850", "DOS-850", "Zeit,Kühlkörper (°C),Wärme (W)"),
+        ("mac-roman", "MacRoman", "Zeit,Kühlkörper (°C),Wärme (W)"),
+        ("utf-16", "UTF-16", "时间,温度(℃),功率(W)"),
+        ("utf-32", "UTF-32", "时间,温度(℃),功率(W)"),
+    ],
+)
+def test_the_words_of_a_header_show_its_encoding(tmp_path, encoding, name, header):
+    path = tmp_path / "run.csv"
+    text = rows(header, *(f"2026-03-01 10:00:0{i},2{i}.5,{i}" for i in range(6)))
+    path.write_bytes(text.encode(encoding))
+    found = read_recording(path)
+    names = [cell.partition("(")[0].strip() for cell in header.split(",")[1:]]
+    assert list(found.columns) == names and found.units == dict(zip(names, ("degC", "W"), strict=True))
+    assert found.t.tolist() == [0, 1, 2, 3, 4, 5] and f"read as {name}" in found.notes
+
+
+def test_a_last_character_that_is_cut_off_is_left_out(tmp_path):
+    path = tmp_path / "run.csv"
+    text = rows("Zeit,Kühler", *(f"2026-03-01 10:00:0{i},2{i}.5 °C" for i in range(9)))
+    path.write_bytes(text.encode()[: -len("C\n") - 1])
+    assert read_recording(path).columns["Kühler"].tolist() == [20.5 + i for i in range(8)]

@@ -6,6 +6,7 @@ that the column holds in the later lines.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import re
@@ -49,6 +50,10 @@ _STATED = re.compile(r"[A-Za-z][^,;\t|:=]{0,60}?\s[:=]\s+\S")  # `Channel : RPM`
 _DECIMALS = re.compile(r"[-+]?\d*[.,]\d+$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _THOUSANDS = re.compile(rb"\.(?<!:\d\d\.)\d{3}(?=[;\t\r\n])")  # the end of 1.050 in a cell
+ENCODINGS = dict(pair.split("=") for pair in WORDS["encodings"].split())  # name for people: Python's name
+_FOREIGN_WORDS = {
+    w for key in ("times", "counters", "units", "quantities") for w in WORDS[key].split() if not w.isascii()
+}
 _KINDS = {"", *WORDS["kinds"].split()}
 
 
@@ -79,25 +84,50 @@ def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
     """Return a file's text as UTF-8 and a note where its encoding is another. Raises InputError."""
     head = data[:4096]
     even, odd = head[::2].count(0), head[1::2].count(0)
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encoding = "utf-16"
+    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        encodings = ["utf-32"]
+    elif head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encodings = ["utf-16"]
     elif max(even, odd) > max(len(head) / 5, 4 * min(even, odd)):  # every other byte of Latin text is zero
-        encoding = "utf-16-be" if even > odd else "utf-16-le"
+        encodings = ["utf-16-be" if even > odd else "utf-16-le"]
     else:
-        try:
-            data.decode("utf-8")
-            return _whole_lines(data)
-        except UnicodeDecodeError:
-            encoding = "cp1252"
-    try:
-        text = data[: len(data) // 2 * 2 if "16" in encoding else None].decode(encoding)
-    except UnicodeDecodeError as e:
+        encodings = ["utf-8"]
+    text = _read_as(data, encodings[0])
+    if text is None and encodings == ["utf-8"]:
+        encodings = _by_words(data)
+    read = ((e, text) for e in encodings if (text := _read_as(data, e)) is not None)
+    encoding, text = next(read, ("", None))
+    if text is None:
         raise InputError(
-            f"{path}: not text in UTF-8, UTF-16 or Windows-1252 (byte {e.start}); save it as UTF-8"
-        ) from None
-    name = {"cp1252": "Windows-1252 (Latin-1)"}.get(encoding, "UTF-16")
-    text_8, notes = _whole_lines(text.encode("utf-8"))
-    return text_8, (f"read as {name}", *notes)
+            f"{path}: not text in UTF-8, UTF-16 or a code page that its words show; save it as UTF-8"
+        )
+    whole, notes = _whole_lines(text.encode("utf-8"))
+    if encoding == "utf-8":
+        return whole, notes
+    name = next((name for name, e in ENCODINGS.items() if e == encoding), encoding[:6].upper())
+    return whole, (f"read as {name}", *notes)
+
+
+def _read_as(data: bytes, encoding: str) -> str | None:
+    """Return the text, without a character that is cut off at the end; None for another encoding."""
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as e:
+        cut = e.reason in ("unexpected end of data", "truncated data", "incomplete multibyte sequence")
+        return data[: e.start].decode(encoding) if cut else None
+
+
+def _by_words(data: bytes) -> list[str]:
+    """Return the encodings of ENCODINGS in which a text holds most known words; the first of equal ones.
+
+    Of the bytes alone most of them make some text."""
+    shown = b"\n".join(islice((m[0] for m in re.finditer(rb"[^\n]*[\x80-\xff][^\n]*", data)), SAMPLE))
+
+    def points(encoding: str) -> int:
+        text = shown.decode(encoding, errors="replace").lower()
+        return sum(len(word) ** 2 for word in _FOREIGN_WORDS if word in text)
+
+    return sorted(ENCODINGS.values(), key=points, reverse=True)
 
 
 def _whole_lines(data: bytes) -> tuple[bytes, tuple[str, ...]]:
