@@ -399,3 +399,26 @@ def test_a_delay_of_an_input_is_checked_as_any_plant():
 def test_what_the_plant_file_says_of_a_ramp_is_not_doubted(said):
     plant, table = ramps(said)
     assert not [f for f in checks(plant, [table]) if f.kind == "between"]
+
+
+def test_fine_readings_that_move_in_each_row_are_not_interpolated():
+    """Found on a clean recording of a slow block: its least step from row to row was a slope, no resolution."""
+    text = """
+    format: thermoctl-plant/1
+    inputs: {heat: {unit: W}, air: {unit: degC, between_samples: linear}}
+    parameters: {C: {value: 100, unit: J/K}, G: {value: 0.2, unit: W/K}}
+    nodes: {one: {unit: degC, storage: C, initial: air, initial_sigma: 1000}}
+    flows: {power: {into: one, rate: heat, unit: W}, loss: {from: one, rate: G * (one - air), unit: W}}
+    outputs: {T: {value: one, unit: degC}}
+    """
+    t = 5.0 * np.arange(500)
+    heat = np.where(np.arange(500) // 60 % 2, 10.0, 0.0)
+    block = np.empty(500)
+    block[0] = 60.0
+    for k in range(499):
+        end = 20 + heat[k] / 0.2
+        block[k + 1] = end + (block[k] - end) * np.exp(-0.2 / 100 * 5)
+    noisy = np.round(block + 0.01 * np.random.default_rng(0).standard_normal(500), 3)
+    columns = {"heat": heat, "air": np.full(500, 20.0), "T": noisy}
+    assert np.abs(np.diff(noisy)).min() > 0.1
+    assert [str(f) for f in checks(loads(text), [Table("run", "run.csv", t, columns)])] == []

@@ -701,3 +701,44 @@ def test_a_last_character_that_is_cut_off_is_left_out(tmp_path):
     text = rows("Zeit,Kühler", *(f"2026-03-01 10:00:0{i},2{i}.5 °C" for i in range(9)))
     path.write_bytes(text.encode()[: -len("C\n") - 1])
     assert read_recording(path).columns["Kühler"].tolist() == [20.5 + i for i in range(8)]
+
+
+def of_local_times(folder, first, back, step):
+    """Write 12 rows at local times, of which those from the sixth on are an hour earlier, or later."""
+    stamps = [datetime.fromisoformat(first) + k * step for k in range(12)]
+    local = [s + timedelta(hours=back) * (k > 5) for k, s in enumerate(stamps)]
+    return read(folder, rows("time,T", *(f"{s},{k}" for k, s in enumerate(local))))
+
+
+@pytest.mark.parametrize("step", [timedelta(minutes=5), timedelta(hours=1)], ids=["5 min", "1 h"])
+@pytest.mark.parametrize("day, back", [("2026-10-25", -1), ("2026-03-29", 1)], ids=["autumn", "spring"])
+def test_local_times_go_on_over_a_change_of_daylight_saving(tmp_path, day, back, step):
+    last = (
+        datetime.fromisoformat(f"{day} 02:00:00") if back > 0 else datetime.fromisoformat(f"{day} 03:00:00")
+    )
+    found = of_local_times(tmp_path, str(last - 6 * step), back, step)
+    assert found.t.tolist() == [k * step.total_seconds() for k in range(12)]
+    assert any("daylight saving after" in n for n in found.notes)
+
+
+def test_an_hour_on_another_day_is_no_daylight_saving(tmp_path):
+    found = of_local_times(tmp_path, "2026-03-27 01:30:00", 1, timedelta(minutes=5))
+    assert found.t[6] == 5400 and not any("daylight" in n for n in found.notes)
+    with pytest.raises(InputError, match="runs backwards"):
+        of_local_times(tmp_path, "2026-10-23 02:30:00", -1, timedelta(minutes=5))
+
+
+@pytest.mark.parametrize(
+    "first, form",
+    [("1970-01-01 00:00:07", "{s}"), ("2000-01-01 00:00:07", "{s}"), ("1970-01-01 00:00:07", "{ms:.0f}")],
+    ids=["1970", "2000", "unix ms"],
+)
+def test_a_clock_that_is_set_during_the_recording(tmp_path, first, form):
+    """A count of ms was read as seconds."""
+    begin, now = datetime.fromisoformat(first), datetime.fromisoformat("2026-03-01 10:00:00")
+    stamps = [(begin if k < 5 else now) + timedelta(seconds=k) for k in range(12)]
+    since = datetime(1970, 1, 1)
+    cells = (form.format(s=s, ms=(s - since).total_seconds() * 1e3) for s in stamps)
+    found = read(tmp_path, rows("time,T", *(f"{c},{k}" for k, c in enumerate(cells))))
+    assert found.t[:5].tolist() == [0, 1, 2, 3, 4] and found.t[5] == (stamps[5] - begin).total_seconds()
+    assert any(f"leap from {first[:10]}" in n and "was the clock set" in n for n in found.notes)

@@ -114,8 +114,8 @@ def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarra
 
 
 def _quantum(values: np.ndarray) -> float:
-    steps = np.abs(np.diff(values))
-    return float(steps[steps > 0].min(initial=np.inf))
+    """Return the step of the readings: the least difference of any two values. Of rows, it may be a slope."""
+    return float(np.diff(np.unique(values)).min(initial=np.inf))
 
 
 def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:

@@ -15,6 +15,7 @@ from thermoctl.units import SECONDS
 
 DAY_NS = 86_400_000_000_000
 DAY_S = 86_400.0
+HOUR_S = 3600.0
 YEAR_S = 365.2425 * DAY_S
 _MONTHS = dict(jan=1, feb=2, mar=3, apr=4, may=5, jun=6, jul=7, aug=8, sep=9, oct=10, nov=11, dec=12)
 _MONTHS |= dict(
@@ -91,6 +92,7 @@ EPOCHS = (
     ("Julian days", DAY_S, -2_440_587.5 * DAY_S, 2_451_544.0, 2_488_070.0),
 )
 YEARS = 20, 39  # range of two digits that are a year rather than a day
+LATE = 0.05  # a clock that nobody has set yet counts from 1970; three years of it are this share of 1998
 LONG = 1e8  # least count since an epoch: hardly any signal has so large numbers
 
 
@@ -112,6 +114,36 @@ class Seconds:
     start: str | None = None
     note: str = ""
     kind: str = "bare"
+
+
+def summer_time(seconds: Seconds) -> Seconds:
+    """Return local times going on evenly over a change to or from daylight saving, with a note.
+
+    Such a change is an hour on a Sunday of spring or autumn before 4 o'clock."""
+    if seconds.kind != "date and time" or seconds.start is None or seconds.start.endswith("Z"):
+        return seconds
+    steps = np.diff(seconds.t)
+    usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
+    t, notes = seconds.t.copy(), [seconds.note]
+    for k in np.flatnonzero(np.abs(np.abs(steps - usual) - HOUR_S) <= max(0.1 * usual, 1.0)):
+        before = later(seconds.start, float(seconds.t[k]))
+        day = np.datetime64(before[:10])
+        sunday = int(day.astype(int) - 3) % 7 == 0  # 1970-01-04 was one
+        if sunday and int(before[5:7]) in (3, 4, 9, 10, 11) and int(before[11:13]) < 4:
+            hour = HOUR_S if steps[k] < usual else -HOUR_S
+            t[k + 1 :] += hour
+            notes.append(f"daylight saving after {before[:19].replace('T', ' ')}: later times {hour:+g} s")
+    return replace(seconds, t=t, note="; ".join(notes))
+
+
+def set_in_between(seconds: Seconds) -> str:
+    """Return a note where dates leap by years: a clock without a battery begins in 1970 or 2000."""
+    steps = np.diff(seconds.t)
+    if seconds.start is None or not len(steps) or not steps.max() > max(YEAR_S, 1e4 * np.median(steps)):
+        return ""
+    k = int(np.argmax(steps))
+    before, after = (later(seconds.start, float(seconds.t[i])).replace("T", " ")[:19] for i in (k, k + 1))
+    return f"the dates leap from {before} to {after}: was the clock set then? The earlier ones are doubtful"
 
 
 def later(start: str, seconds: float) -> str:
@@ -208,7 +240,13 @@ def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Se
     finite = values[np.isfinite(values)]
     for name, scale, zero, low, high in EPOCHS if len(finite) else ():
         stated = unit is None or abs(SECONDS.get(unit, np.nan) - scale) < 1e-9 * scale
-        if stated and low <= finite.min() and finite.max() <= high and (dated or low > LONG):
+        unset = int(np.argmax(finite >= low)) if name.startswith("unix") and finite[0] >= 0 else 0
+        right = (
+            low <= finite[unset:].min()
+            and finite.max() <= high
+            and finite[:unset].max(initial=0) < LATE * low
+        )
+        if stated and right and (dated or low > LONG):
             if scale == DAY_S:
                 values = _of_days(values)
                 finite = values[np.isfinite(values)]

@@ -23,7 +23,6 @@ from thermoctl.recording.foreign.units import column_of, interval, known, named,
 from thermoctl.recording.table import Table
 
 _ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
-HOUR_S = 3600.0
 MIXED = "times in UTC beside times of a zone that is not stated; write all of them in UTC"
 _SINCE = re.compile(r", from \d{4}-\d\d-\d\d [\d:.]+( UTC)?")
 
@@ -188,10 +187,16 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
     final, said = _final_names(path, sheet, [n for _, names in several for n in names])
     for timer, names in several:
         _refuse_lost(sheet, timer)
+        timer = replace(timer, seconds=clock.summer_time(timer.seconds))
         t = np.full(len(sheet), np.nan)
         t[: len(timer.seconds.t)] = timer.seconds.t
         values: dict[str, np.ndarray] = {}
-        notes = [_clock_note(timer, how), clock.rounding(timer.seconds.t), *said]
+        notes = [
+            _clock_note(timer, how),
+            clock.set_in_between(timer.seconds),
+            clock.rounding(timer.seconds.t),
+            *said,
+        ]
         for name in names:
             column = sheet.columns[name]
             if not isinstance(column, np.ndarray) or column.dtype.kind != "f":
@@ -373,7 +378,9 @@ def _one_run(sheet: Sheet, t: np.ndarray, rows: np.ndarray, how: How, notes: lis
     row, before = int(rows[back[0] + 1]), int(rows[back[0]])
     jump = float(t[before] - t[row])
     usual = float(np.median(np.abs(np.diff(t[rows]))))
-    hour = " by an hour (daylight saving?)" if abs(jump + usual - HOUR_S) <= max(1.5 * usual, 1.0) else ""
+    hour = (
+        " by an hour (daylight saving?)" if abs(jump + usual - clock.HOUR_S) <= max(1.5 * usual, 1.0) else ""
+    )
     raise InputError(
         f"{sheet.place(row)}: the time {t[row]:.17g} runs backwards from {t[before]:.17g}{hour}: {len(parts)} runs in one "
         f"file? --run 1 reads the first, up to --run {len(parts)}"
