@@ -70,6 +70,16 @@ def frozen(a, b):
     return change
 
 
+def overflowing(share, bits):
+    """Return readings of a counter of `bits` that spans a share of the travel, scaled to the unit."""
+
+    def change(v):
+        step = share * np.ptp(v) / 2**bits
+        return v.min() + step * ((np.round((v - v.min()) / step) + 2 ** (bits - 2)) % 2**bits)
+
+    return change
+
+
 def fahrenheit(v):
     return 1.8 * v + 32
 
@@ -118,6 +128,9 @@ DAMAGES = {
         True,
     ),
     "sensor converted twice": (TWO, column("temperature_1", lambda v: (v - 32) / 1.8), "unit", "converted from degF twice", True),
+    "counter of 8 bits": (STAGE, column("encoder", overflowing(0.6, 8)), "wrapped", "numpy.unwrap", True),
+    "counter of 16 bits": ("carriage", column("encoder", overflowing(0.9, 16)), "wrapped", "period=0.1355", True),
+    "counter of 32 bits": (STAGE, column("encoder", overflowing(0.3, 32)), "wrapped", "against its motion", True),
     "sampled too slowly": ("carriage", rows(lambda n: np.arange(0, n, 1000 // 4)), "sampling", "miss", False),
 }  # fmt: skip
 
@@ -422,3 +435,28 @@ def test_fine_readings_that_move_in_each_row_are_not_interpolated():
     columns = {"heat": heat, "air": np.full(500, 20.0), "T": noisy}
     assert np.abs(np.diff(noisy)).min() > 0.1
     assert [str(f) for f in checks(loads(text), [Table("run", "run.csv", t, columns)])] == []
+
+
+def test_a_siphon_that_empties_is_no_counter():
+    """A level that falls at once and rises again leaps one way, by no power of two of the gauge's step."""
+    text = """
+    format: thermoctl-plant/1
+    inputs: {pump: {unit: m^3/s}}
+    parameters: {A: {value: 0.01, unit: m^2}}
+    nodes: {level: {unit: m, storage: A, initial: first(gauge)}}
+    flows: {feed: {into: level, rate: pump, unit: m^3/s}}
+    outputs: {gauge: {value: level, unit: m, noise: 0.001}}
+    """
+    t = np.arange(400.0)
+    level = np.round(0.02 + (0.0011 * t + 0.01) % 0.0811, 4)
+    columns = {"pump": np.where(t > 100, 1.1e-5, 1.0e-5), "gauge": level}
+    assert "wrapped" not in {f.kind for f in checks(loads(text), [Table("run", "run.csv", t, columns)])}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_at_rest_is_no_counter(seed):
+    """Its largest leaps reach from end to end, as those of a counter do: 29 of 400 rows had been a severe finding."""
+    plant, table = rig("one block")
+    noise = np.random.default_rng(seed).normal(0, 0.1, len(table))
+    rest = {**table.columns, "temperature": 21.5 + noise, "heat": np.zeros(len(table))}
+    assert "wrapped" not in {f.kind for f in checks(plant, [dataclasses.replace(table, columns=rest)])}

@@ -532,6 +532,13 @@ def test_units_above_the_names(tmp_path, title, units):
     assert found.units == {"I": "mA", "T": "degC"}
 
 
+@pytest.mark.parametrize("units", [";mA;degC", "Logger 7;;\n;[mA];[degC]"], ids=["plain", "below a title"])
+def test_units_above_the_names_without_one_of_the_time(tmp_path, units):
+    """The line was left out, and milliamperes were read as amperes."""
+    found = read(tmp_path, f"{units}\nDate;I;T\n2026-03-01 10:00:00;1;20\n2026-03-01 10:00:01;2;21\n")
+    assert found.units == {"I": "mA", "T": "degC"} and found.t.tolist() == [0, 1]
+
+
 def test_letters_of_channels_above_the_names_are_no_units(tmp_path):
     found = read(tmp_path, "A;V;C\ntime;speed;flow\n0;1;20\n1;2;21\n2;4;23\n")
     assert found.units == {} and list(found.columns) == ["speed", "flow"]

@@ -25,6 +25,8 @@ ALARM = 1e-6  # probability of a false alarm for each column and recording
 SIGMAS = 6.0
 FEW = 8  # with fewer samples nothing is checked
 FREE = 12  # iterations of the refit that tests whether the plant moves like this without its inputs
+JOINED = 0.45  # largest other step of a counter that overflows, over its period: from 0.5 on nothing joins it
+TURNS = 0.7  # share of overflows with motion on both sides; at the others it turns round or stands
 SLOWS = 0.25  # a body comes to rest if its last steps are below this share of its mean step
 
 
@@ -188,6 +190,7 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             findings.append(Finding("still", table.path, what, advice))
             continue
         findings += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
+        findings += _wrapped(table, o.column, y, simulated, o.unit or "")
     scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
     driving = [
         i
@@ -237,6 +240,39 @@ def driving_inputs(plant: Plant) -> list[Input]:
 def moves(table: Table, column: str) -> bool:
     """Return whether a column has two different values."""
     return bool(np.nanmax(table.columns[column]) > np.nanmin(table.columns[column]))
+
+
+def _wrapped(table: Table, column: str, y: np.ndarray, simulated: np.ndarray, unit: str) -> list[Finding]:
+    """Find a counter that overflows, or an angle that begins again: leaps by a period against the motion.
+
+    Noise alone leaps as far as it reaches: the other steps have to be far below the period. Stick-slip and
+    siphons leap, too. So the period has to be a turn or a power of two of the readings' step,
+    or the leaps go both ways."""
+    steps = np.diff(y)
+    far = np.flatnonzero(np.abs(steps) > 0.5 * np.ptp(y))
+    far = far[(far > 0) & (far < len(steps) - 1)]
+    if not 0 < len(far) <= len(steps) // FEW or np.abs(np.diff(simulated)).max() > 0.5 * np.ptp(y):
+        return []
+    before, after, leaps = steps[far - 1], steps[far + 1], steps[far]
+    periods = np.abs(leaps - (before + after) / 2)
+    error = float(np.abs(np.delete(steps, far)).max(initial=0.0))
+    against = np.sign(before) == np.sign(after)
+    against &= np.sign(before) == -np.sign(leaps)
+    if against.mean() < TURNS or np.ptp(periods) > 2 * error or np.median(periods) < np.ptp(y) - error:
+        return []
+    period = float(np.median(periods))
+    if error > JOINED * period:
+        return []
+    bits = _quantum(y) * 2.0 ** round(log(period / _quantum(y), 2))
+    turn = {"deg": 360.0, "rad": 2 * np.pi}.get(unit, np.inf)
+    both = leaps.min() < 0 < leaps.max()
+    sure = [size for size in (bits, turn) if abs(period - size) <= min(error, 0.01 * size)]
+    if not (sure or both):
+        return []
+    period = sure[0] if sure else period
+    what = f"'{column}' leaps {len(far)} times by {period:.6g} against its motion, first after t = {table.t[far[0]]:.6g} s"
+    advice = f"A counter that overflows? Join it: numpy.unwrap(values, period={period:.6g})."
+    return [Finding("wrapped", table.path, what, advice)]
 
 
 def _stuck(

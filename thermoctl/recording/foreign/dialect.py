@@ -381,11 +381,18 @@ def _unit_lines(lines_of: list[tuple[int, list[str]]]) -> list[tuple[int, list[s
 
 
 def _are_above(cells: list[str], names: list[str]) -> bool:
-    """Return whether a line is units of the names below: the first one of a time, the names without any."""
+    """Return whether a line is units of the names below, which have none; the first is a time's or empty."""
     units, others = ([known(_bare(c)) for c in line if c] for line in (cells, names))
     stated = any(split_words(c)[1] for c in names)
-    is_time = time_unit(_bare(cells[0])) is not None
-    return is_time and all(units) and not all(others) and not stated and _is_units(cells, names)
+    is_time = not cells[0] or time_unit(_bare(cells[0])) is not None
+    return (
+        is_time
+        and bool(names[0])
+        and all(units)
+        and not all(others)
+        and not stated
+        and _is_units(cells, names)
+    )
 
 
 def _header(
