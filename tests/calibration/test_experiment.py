@@ -294,3 +294,20 @@ def test_the_rows_of_a_test_are_kept_where_its_disk_is_full(quick, capsys, monke
         r"a\.csv: No space left .* its (\d+) rows are in (\S+a\.csv): move", capsys.readouterr().err
     )
     assert said and len(read_table(said[2])) == int(said[1]) > 20 and not (quick / "a.csv").exists()
+
+
+@pytest.mark.parametrize("damaged", ["", "\0\0\0", "nan", "-5"])
+def test_a_damaged_note_of_the_time_reached_is_named(quick, capsys, damaged):
+    """A power cut can leave it empty; the rows beside it stay as they are."""
+    (quick / "short.parquet").write_text("rows")
+    (quick / "short.parquet.progress").write_text(damaged)
+    command = "experiment test_2 --config rig.yaml --out short.parquet --resume --yes"
+    assert cli.main(command.split()) == 2
+    assert "short.parquet.progress: " in (said := capsys.readouterr().err) and "start again without" in said
+    assert (quick / "short.parquet").read_text() == "rows"
+
+
+@pytest.mark.parametrize("hours", ["0", "-1", "0.0001", "nan", "inf"])
+def test_simulated_hours_hold_a_cycle(quick, capsys, hours):
+    assert cli.main(["run", "--config", "rig.yaml", "--simulated-time", "--hours", hours]) == 2
+    assert "at least 0.021, one cycle, was expected" in capsys.readouterr().err

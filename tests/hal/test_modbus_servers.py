@@ -336,6 +336,7 @@ def line():
         lines.append(RtuLine(spoil))
         return links.join(f"rtu:{os.ttyname(lines[-1].slave)}", LineSettings(latency_timer_ms=0), 0.2)
 
+    make.lines = lines
     yield make
     for made_line in lines:
         made_line.done = True
@@ -448,3 +449,48 @@ def test_a_wrong_rtu_answer_names_what_is_wrong(line, spoil, words):
 def test_an_rtu_exception_behind_an_echo_is_its_code(line):
     body = b"\x01\x83\x02"
     assert line(lambda r, a: r + body + modbus_crc(body)).read("holding", 0, 1, 1, 0.5) == 2
+
+
+def read_frame(unit, address, count=1):
+    body = struct.pack(">BBHH", unit, 3, address, count)
+    return body + modbus_crc(body)
+
+
+def answer_frame(unit, value):
+    body = struct.pack(">BBBH", unit, 3, 2, value)
+    return body + modbus_crc(body)
+
+
+@pytest.mark.parametrize("unit", [1, 9], ids=["our unit", "another unit"])
+def test_the_answer_to_another_master_is_not_taken(line, unit):
+    """An answer names no register: its value was taken for ours."""
+    strange = [read_frame(unit, 40) + answer_frame(unit, 6000)]
+    link = line(lambda request, answer: (strange.pop() if strange else b"") + answer)
+    with pytest.raises(links.NoAnswer, match=f"another master asks unit {unit} on this line"):
+        link.read("holding", 0, 1, 1, 0.2)
+    with contextlib.suppress(links.NoAnswer):  # function 8 clears the line first
+        assert link.read("holding", 0, 1, 1, 0.2) == [2345]
+    assert link.read("holding", 0, 1, 1, 0.2) == [2345]
+
+
+def test_an_answer_before_the_request_of_another_master_is_ours(line):
+    strange = read_frame(1, 40) + answer_frame(1, 6000)
+    link = line(lambda request, answer: answer + strange)
+    for _ in range(3):
+        assert link.read("holding", 0, 1, 1, 0.5) == [2345]
+
+
+def test_a_request_waits_for_the_answer_to_another_master(line):
+    """Another master had asked just before; its answer came behind our request."""
+
+    def slow(request, answer):
+        time.sleep(0.06)  # a unit answers one request after the other
+        return answer
+
+    link = line(slow)
+    assert link.read("holding", 0, 1, 1, 0.5) == [2345]
+    master = line.lines[-1].master
+    os.write(master, read_frame(1, 40))
+    threading.Timer(0.03, os.write, (master, answer_frame(1, 6000))).start()
+    time.sleep(0.01)
+    assert link.read("holding", 0, 1, 1, 0.5) == [2345]

@@ -4,6 +4,7 @@ A test of setpoints on a rig, or an experiment of inputs on a plant file."""
 
 from __future__ import annotations
 
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -98,11 +99,25 @@ def _progress(path: Path) -> Path:
     return path.with_name(path.name + ".progress")
 
 
+def _reached(path: Path) -> float:
+    """Return the time, s, that an unfinished recording reached. Raises InputError for a damaged file."""
+    text = _progress(path).read_text(errors="replace")
+    try:
+        if 0.0 <= (reached_s := float(text)) < math.inf:
+            return reached_s
+    except ValueError:
+        pass
+    raise InputError(
+        f"{_progress(path)}: '{text[:40]}': the seconds that {path} reached were expected; name another file by --out and start "
+        "again without --resume"
+    )
+
+
 def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, resume: bool) -> int:
     """Run a schedule and write the rows; no signal ends it before they are written."""
     earlier, at_s = None, 0.0
     if resume and _progress(path).exists():
-        earlier, at_s = drive.earlier_part(rig, path, float(_progress(path).read_text()), print)
+        earlier, at_s = drive.earlier_part(rig, path, _reached(path), print)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
     done_s = [at_s]

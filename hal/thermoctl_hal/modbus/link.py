@@ -13,7 +13,8 @@ Bytes that arrived before a request, such as a late answer, are dropped. An answ
 name its register. So after a lost answer a unit is asked for an echo (function 8) first. Units answer in
 order: everything before the echo is late. A server that closes the connection after an answer is connected
 again for the next request. One that is silent after connecting gets more time at each connection. On a serial
-line the echo of the request and bytes before the answer are passed over.
+line the echo of the request and bytes before the answer are passed over. Behind the request of another master
+comes its answer, which may be to another register: no answer is taken from there on.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ REFUSAL = 0x80  # bit of the function code of an exception
 EXCEPTION_CODES = range(1, 12)
 # Bytes of the shortest RTU frame; number of bytes of a bad answer that a message shows.
 MIN_RTU, SHOWN = 4, 12
+READ_SIZE = 8  # bytes of an RTU request for registers or bits
+OTHERS_S = 0.1  # time in which a unit answers another master
 HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
@@ -239,9 +242,12 @@ class Link:
         self._free_s = time.monotonic() + (max(GAP_MIN_S, characters) if self._is_rtu else 0.0)
 
     def _drop(self) -> None:
-        """Drop the bytes that came before this request. Raises _Closed, OSError."""
-        while select.select([self._line], [], [], 0.0)[0]:
-            self._take()
+        """Drop the bytes that came before this request, and the answer to another master.
+
+        Raises _Closed, OSError."""
+        last = b""
+        while select.select([self._line], [], [], OTHERS_S if self._is_rtu and _is_read(last) else 0.0)[0]:
+            last = (last + self._take())[-READ_SIZE:]
 
     def _catch_up(self, request: _Request, timeout_s: float) -> None:
         """Send function 8 and wait for its answer; everything before that is late and dropped.
@@ -299,6 +305,8 @@ class Link:
             at = len(request.frame)
             self._echoes = True
         for begin in range(at, len(received) - MIN_RTU):
+            if _is_of_another(received[begin : begin + READ_SIZE], request):
+                return None  # its answer is next
             if received[begin] != request.unit:
                 continue
             size = _rtu_size(received[begin:], request)
@@ -322,6 +330,12 @@ class Link:
         text = f"no valid answer: {len(data)} bytes came ({data[:SHOWN].hex(' ')}{more})"
         if not self._is_rtu:
             return f"{text}: {_wrong_tcp(data, request)}"
+        frames = (data[i : i + READ_SIZE] for i in range(len(data)))
+        other = next((f for f in frames if _is_of_another(f, request)), None)
+        if other is not None:
+            return (
+                f"another master asks unit {other[0]} on this line ({other.hex(' ')}): a line has one master"
+            )
         data = data.lstrip(b"\0") if request.unit else data
         if len(data) < MIN_RTU or not _has_good_crc(data):
             return f"{text} with a wrong CRC, or cut short: check the baud rate, parity, termination and other masters"
@@ -343,6 +357,20 @@ def _rtu_size(data: bytes, request: _Request) -> int:
     if data[1] != request.function:
         return 0
     return 8 if request.function in (WRITE_COIL, 6, WRITE_SEVERAL) else 5 + data[2]
+
+
+def _is_read(frame: bytes) -> bool:
+    """Return whether a frame asks a unit for registers or bits.
+
+    An answer with three bytes of bits is as long."""
+    if len(frame) != READ_SIZE or frame[1] not in FUNCTIONS.values() or not _has_good_crc(frame):
+        return False
+    return frame[2] != READ_SIZE - 5 or frame[1] not in (FUNCTIONS[kind] for kind in BITS)
+
+
+def _is_of_another(frame: bytes, request: _Request) -> bool:
+    """Return whether another master sent this frame."""
+    return frame != request.frame and _is_read(frame)
 
 
 def _with_crc(body: bytes) -> bytes:

@@ -13,6 +13,7 @@ from thermoctl.control.model import CompensatorModel, Parameters, packed_length
 from thermoctl.daemon.tick.assemble import compensator, law_parameters
 from thermoctl.daemon.tick.loop import RELOAD, Axis
 from thermoctl.daemon.tick.ring import Box, Mailbox
+from thermoctl.files.yamlfile import InputError
 from thermoctl.rig.signals import AT, fault_word
 from thermoctl_hal.rig.make import make_backend
 
@@ -115,6 +116,8 @@ def trapezoids(settings: Settings, hours: float, compensate: bool, out: str | No
 
     The reference encoder, which the law never reads, measures it while the reference has stood for SETTLE_S.
     out: file of ten rows a second, Parquet. Returns 0 when all deviations are within 0.5 um, else 1."""
+    if not CYCLE_S <= hours * 3600.0 < np.inf:
+        raise InputError(f"--hours {hours:g}: at least {CYCLE_S / 3600:.3f}, one cycle, was expected")
     parameters = dataclasses.replace(law_parameters(settings), compensate=float(compensate))
     simulation = Simulation(settings, parameters=parameters)
     simulation.arm()
