@@ -303,3 +303,10 @@ def described(d: Dimension) -> str:
         for base, q in sorted(d, key=lambda pair: (pair[0] != "kg", order.get(pair[0], 99)))
     )
     return f"{_WRITTEN[written]} = {written}" if written in _WRITTEN else written or "dimensionless"
+
+
+def readable_time(seconds: float) -> str:
+    """Return a time in its largest unit of which it has two: 90 s, 12.5 min, 3.1 h, 5 days, 40 years."""
+    sizes = {"years": 365.2425 * SECONDS["d"], "days": SECONDS["d"], "h": SECONDS["h"], "min": SECONDS["min"]}
+    name, size = next(((n, s) for n, s in sizes.items() if seconds >= 2 * s), ("s", 1.0))
+    return f"{seconds / size:.3g} {name}"

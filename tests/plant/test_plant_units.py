@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import loads
-from thermoctl.units import SYMBOLS, dimension
+from thermoctl.units import SYMBOLS, dimension, readable_time
 
 PLANT = """format: thermoctl-plant/1
 inputs: {{P: {{unit: W}}, air: {{unit: degC}}, v: {{unit: m/s}}}}
@@ -110,3 +110,18 @@ def test_any_text_is_a_dimension_or_one_error(text):
         dimension(text)
     except ValueError as e:
         assert "\n" not in str(e)
+
+
+@pytest.mark.parametrize(
+    "seconds, text",
+    [
+        (0.004, "0.004 s"),
+        (90, "90 s"),
+        (750, "12.5 min"),
+        (7560, "2.1 h"),
+        (259200, "3 days"),
+        (1.2623e9, "40 years"),
+    ],
+)
+def test_a_time_is_written_in_a_readable_unit(seconds, text):
+    assert readable_time(seconds) == text

@@ -20,6 +20,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 from thermoctl.recording.foreign.logger import options
+from thermoctl.units import readable_time
 
 
 def check_effects(args: argparse.Namespace) -> int:
@@ -59,10 +60,10 @@ def plan_experiment(args: argparse.Namespace) -> int:
 def _show(planned: Planned) -> None:
     console = Console() if sys.stdout.isatty() else Console(width=120)
     report(planned.checks, sys.stdout)
-    span = f"{planned.duration_s:.4g} s, a sample every {planned.interval_s:.3g} s"
+    span = f"{readable_time(planned.duration_s)}, a sample every {readable_time(planned.interval_s)}"
     if planned.slowest_s:
         share = planned.duration_s / planned.slowest_s
-        span += f"; the plant's slowest time constant, {planned.slowest_s:.3g} s, fits in {share:.1f} times"
+        span += f"; the plant's slowest time constant, {readable_time(planned.slowest_s)}, fits in {share:.1f} times"
     console.print(f"[bold]experiment[/] {span}")
     if planned.parameters:
         console.print(_parameters(planned))

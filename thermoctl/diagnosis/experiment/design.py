@@ -17,7 +17,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
-from thermoctl.units import dimension
+from thermoctl.units import dimension, readable_time
 
 TOGETHER = 0.98  # correlation from which two inputs count as one lever, such as voltage and current
 # Dimensions of temperature, sunshine and pressure: these cannot be commanded.
@@ -198,7 +198,7 @@ def family(plant: Plant, tables: Sequence[Table], driven: Sequence[Lever], step_
                 for n, (factor, offset) in lever.moves.items()
             }
             for start in starts if share == LENGTHS[0] else starts[:1]:
-                text = f"{title}, {duration_s:.5g} s"
+                text = f"{title}, {readable_time(duration_s)}"
                 if len(starts) > 1:
                     text += ", from " + ", ".join(f"{n} {v:.4g}" for n, v in start.items())
                 out.append(Excitation(text, duration_s, corners, constant | start))

@@ -36,6 +36,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Scale
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
+from thermoctl.units import readable_time
 
 MOST = 5  # largest number of hypotheses that are compared
 LIKELY = 0.02  # a hypothesis below this share of the likeliest one is not worth rig time
@@ -302,7 +303,7 @@ def _entry(comparison: _Comparison, best: _Trial, candidates: int) -> dict[str, 
     return {
         "profile": x.title,
         "why": f"{does} {first.label} apart from {others[int(np.argmin(sigmas))].label} by {sigmas.min():.1f} "
-        f"standard errors, after what their parameters are still uncertain by ({best.bits:.2f} bits in {hours:.3g} h; "
+        f"standard errors, after what their parameters are still uncertain by ({best.bits:.2f} bits in {readable_time(x.duration_s)}; "
         f"best per hour of {candidates} candidates).",
         "also_helpful": None if np.all(sigmas**2 >= DECIDES) else _sensor(comparison, best),
         "duration_s": x.duration_s,
