@@ -32,9 +32,10 @@ bench-law: develop                 # cost of a call of the law, by compiler
 
 # Tests that only compute share two cores; then those that run in real time have both to themselves.
 COMPUTED := $(addprefix tests/,advice api calibration checks concealed control diagnose disk export fleet fuzz identify laws \
-	people/test_extras.py plant proof recording reproduction rigs truth tune walkthrough) $(wildcard tests/test_*.py)
-# Tests of whole programs, which wait most of their time. What is left keeps times of milliseconds, so it runs alone.
-PROGRAMS := $(addprefix tests/,daemon devices hazards people)
+	people/test_extras.py plant proof recording reproduction rigs truth tune) $(wildcard tests/test_*.py)
+# Tests of whole programs, which wait most of their time; those of a file go on one after another.
+# What is left keeps times of milliseconds, so it runs alone.
+PROGRAMS := $(addprefix tests/,daemon devices hazards people walkthrough)
 # Property tests repeat the same examples (Hypothesis profile ci): a clean checkout that passes, passes again.
 EXAMPLES ?= ci
 test: develop lint                 # lint and all quick tests; EXAMPLES=default draws new examples of the properties

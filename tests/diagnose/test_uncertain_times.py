@@ -16,7 +16,7 @@ from thermoctl.recording.table import Table
 RATE, SHARE = 200.0, 0.03  # samples a second; error of a time in sampling intervals
 
 
-@pytest.mark.parametrize("share", [0.0, SHARE])
+@pytest.mark.parametrize("share", [0.0, pytest.param(SHARE, marks=pytest.mark.slow)])
 def test_uncertain_times_are_said_and_named_as_no_physics(tmp_path, share):
     path = tmp_path / "plant.yaml"
     path.write_text(SPRING_STAGE)

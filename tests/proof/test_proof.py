@@ -295,6 +295,7 @@ def fake(job, out: str) -> dict:
     return told
 
 
+@pytest.mark.slow
 def test_a_killed_worker_loses_nothing_and_done_cases_are_not_run_again(tmp_path):
     import cloudpickle
 
