@@ -196,10 +196,11 @@ wrong-plants: develop              # wrong plants and damaged recordings: docs/p
 fmu-back: develop                  # ten plants with a hidden effect, diagnosed with the plant file and with its FMU: a table; minutes
 	$(BIN)/python -m tests.plant.fmu_back
 
-.PHONY: test-resolve
+.PHONY: test-diagnosis
 test-diagnosis: develop            # tests of the diagnosis and of the paper's method that take a minute or more each
 	$(BIN)/python -m pytest -m slow -n 2 tests/diagnose tests/laws tests/plant/test_strangers.py tests/proof tests/reproduction
 
+.PHONY: test-resolve
 test-resolve: develop              # two equally good effects, separated by the proposed experiment
 	$(BIN)/python -m pytest -m slow tests/diagnose/test_next_experiment.py
 

@@ -153,5 +153,5 @@ def test_a_parameter_that_ends_at_a_bound_is_noted():
         plant = loads(DECAY.replace("0.5, range: [0.05, 5]", f"2, range: [{low}, 5]"))
         return contract(diagnose(plant, [table], {}, limits()))["notes"]
 
-    assert any(n.startswith("k (1) ends at the bound of its range") for n in notes(1))
+    assert any("at a bound of the range in the plant file: k (1);" in n for n in notes(1))
     assert not any("bound" in n for n in notes(0.05))

@@ -483,14 +483,23 @@ def test_an_answer_before_the_request_of_another_master_is_ours(line):
 def test_a_request_waits_for_the_answer_to_another_master(line):
     """Another master had asked just before; its answer came behind our request."""
 
-    def slow(request, answer):
-        time.sleep(0.06)  # a unit answers one request after the other
+    answered = threading.Event()
+    answered.set()
+
+    def in_turn(request, answer):
+        answered.wait(1.0)  # a unit answers one request after the other
         return answer
 
-    link = line(slow)
+    link = line(in_turn)
     assert link.read("holding", 0, 1, 1, 0.5) == [2345]
-    master = line.lines[-1].master
+    master, slave = line.lines[-1].master, line.lines[-1].slave
+    answered.clear()
     os.write(master, read_frame(1, 40))
-    threading.Timer(0.03, os.write, (master, answer_frame(1, 6000))).start()
-    time.sleep(0.01)
+    assert select.select([slave], [], [], 1.0)[0]  # the other request is on the line
+
+    def answer_other():
+        os.write(master, answer_frame(1, 6000))
+        answered.set()
+
+    threading.Timer(0.03, answer_other).start()
     assert link.read("holding", 0, 1, 1, 0.5) == [2345]

@@ -717,7 +717,7 @@ def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
 
 def _named(table, count):
     rows = {k: v[:count] for k, v in table.columns.items()}
-    return {"one": np.arange(count), "two": np.arange(count), "air": np.arange(count), **rows}
+    return {"t": table.t[:count], **dict.fromkeys(("one", "two", "air"), np.arange(count)), **rows}
 
 
 @pytest.mark.parametrize("linked", [True, False])

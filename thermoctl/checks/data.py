@@ -246,8 +246,8 @@ def _wrapped(table: Table, column: str, y: np.ndarray, simulated: np.ndarray, un
     """Find a counter that overflows, or an angle that begins again: leaps by a period against the motion.
 
     Noise alone leaps as far as it reaches: the other steps have to be far below the period. Stick-slip and
-    siphons leap, too. So the period has to be a turn or a power of two of the readings' step,
-    or the leaps go both ways."""
+    siphons leap, too. So the period has to be a turn or a power of two of the readings' step, or the leaps go
+    both ways."""
     steps = np.diff(y)
     far = np.flatnonzero(np.abs(steps) > 0.5 * np.ptp(y))
     far = far[(far > 0) & (far < len(steps) - 1)]
@@ -258,10 +258,10 @@ def _wrapped(table: Table, column: str, y: np.ndarray, simulated: np.ndarray, un
     error = float(np.abs(np.delete(steps, far)).max(initial=0.0))
     against = np.sign(before) == np.sign(after)
     against &= np.sign(before) == -np.sign(leaps)
-    if against.mean() < TURNS or np.ptp(periods) > 2 * error or np.median(periods) < np.ptp(y) - error:
-        return []
     period = float(np.median(periods))
-    if error > JOINED * period:
+    if against.mean() < TURNS or np.ptp(periods) > 2 * error or not error <= JOINED * period:
+        return []
+    if period < np.ptp(y) - error:
         return []
     bits = _quantum(y) * 2.0 ** round(log(period / _quantum(y), 2))
     turn = {"deg": 360.0, "rad": 2 * np.pi}.get(unit, np.inf)

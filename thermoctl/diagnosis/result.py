@@ -289,15 +289,11 @@ def _at_bounds(d: Diagnosis) -> list[str]:
         bound = low if side == "low" else high
         if bound:
             ends.append(f"{q} ({bound:g})")
-    one = len(ends) == 1
-    return (
-        [
-            f"{listed(ends)} {'ends at the bound of its range' if one else 'end at bounds of their ranges'}: the "
-            f"truth may lie beyond, and what was found may stand for that; widen the {'range' if one else 'ranges'} if physics allows it"
-        ]
-        if ends
-        else []
-    )
+    if not ends:
+        return []
+    return [
+        f"at a bound of the range in the plant file: {listed(ends)}; the truth may lie beyond, and what was found may stand for that"
+    ]
 
 
 def unfinished(*fits: Fitted) -> list[str]:

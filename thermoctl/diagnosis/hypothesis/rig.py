@@ -31,8 +31,8 @@ MOVING = ("velocity", "rotation")
 FLOWING = ("volume flow", "mass flow")
 # Kinds by unit of a node that structure makes a velocity, and of its position.
 RATES, PLACES = ("", *MOVING, *FLOWING, "voltage"), ("", "length", "voltage")
-# Values may be white noise up to so many standard deviations below the mean 2 of von Neumann's ratio, and
-# from this ratio on.
+# Von Neumann's ratio of white noise is 2, with a standard deviation of 2 / sqrt(n). A column may be noise if
+# its ratio is at most so many of these below. However few its rows are, noise has to be half of its variance.
 WHITE, HALF = 3.0, 1.0
 JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
 # Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result

@@ -59,9 +59,12 @@ def choices(
 
     A flow between nodes that the plant file does not link has to explain something at both."""
     links = [{f.source, f.target} for f in rig.physics.flows.values()]
-    at = [p for p in where if {*p.nodes} & {*nodes}]
-    at = [p for p in at if {*p.nodes} <= {*nodes} or not p.source or p.flows or {*p.nodes} in links]
-    return [(p, s) for p in at for s in signals(rig, p, linear.metric.signals)]
+
+    def explains(p: Place) -> bool:
+        new = p.source and not p.flows and {*p.nodes} not in links
+        return {*p.nodes} <= {*nodes} if new else bool({*p.nodes} & {*nodes})
+
+    return [(p, s) for p in where if explains(p) for s in signals(rig, p, linear.metric.signals)]
 
 
 def log_number(combos: Sequence[tuple[Place, Signal]]) -> float:

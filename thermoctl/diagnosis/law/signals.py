@@ -193,16 +193,18 @@ def rates(rig: Rig, place: Place, runs: Sequence[Values], beside: Sequence[Signa
     """Return the plant's own flows at a place that no signal `beside` them is in proportion to.
 
     As factors of a law: inhibition, fouling and wear change a flow that the plant has."""
+    if place.part != "flow":
+        return []
     ends = {place.target, place.source} - {None}
-    at = [f for f in rig.physics.flows.values() if ends <= {f.source, f.target} and not ex.calls_fmu(f.rate)]
     known = [_values(s.value, runs) for s in beside]
-    out = []
-    for f in at if place.part == "flow" else ():
-        v = _values(f.rate, runs)
-        alike = any(abs(v @ w) > ALIKE * np.linalg.norm(v) * np.linalg.norm(w) for w in known)
-        s = None if alike else _sized(Signal(f.name, f.rate, f.unit), runs)
-        out += [s] if s else []
-    return out
+
+    def alike(rate: Expr) -> bool:
+        v = _values(rate, runs)
+        return any(abs(v @ w) > ALIKE * np.linalg.norm(v) * np.linalg.norm(w) for w in known)
+
+    at = [f for f in rig.physics.flows.values() if ends <= {f.source, f.target} and not ex.calls_fmu(f.rate)]
+    sized = [_sized(Signal(f.name, f.rate, f.unit), runs) for f in at if not alike(f.rate)]
+    return [s for s in sized if s is not None]
 
 
 def _follows(column: str, p: Plant, runs: Sequence[Values]) -> bool:
@@ -269,7 +271,7 @@ def _values(e: Expr, runs: Sequence[Values]) -> np.ndarray:
 
 
 def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
-    values = np.concatenate([np.atleast_1d(np.asarray(ex.evaluate(s.value, v), float)) for v in runs])
+    values = _values(s.value, runs)
     centre = float(np.mean(values)) if s.kelvin is not None or s.position else 0.0
     size = float(np.sqrt(np.mean((values - centre) ** 2)))
     if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):

@@ -1,4 +1,4 @@
-"""Rivals of every effect: a number that the plant file fixes is off by a factor.
+"""Rivals of every effect: a number that the plant file fixes is wrong.
 
 A refit cannot move a fixed storage or rate. So its error takes the shape of an effect, such as a missing
 mass. The entries of config/mistakes/ free one such number each: a factor, a constant, or an exponent. They
