@@ -124,3 +124,12 @@ def test_what_a_plant_does_not_follow_is_no_outlier(steep):
     table.columns["gauge"] += 1e-12 * np.exp(t / 20) if steep == "at the end" else late
     kept = case(loads(LEAKY), [table], catalogue(), Budget(80))
     assert np.isfinite(kept.tables[0].columns["gauge"]).all()
+
+
+def test_two_wild_readings_in_a_row_are_left_out_where_no_input_switches():
+    """A filmed pendulum has such pairs: kept, they hid its friction and its drag behind a law."""
+    t = np.arange(600.0)
+    table = compile_plant(loads(LEAKY)).measure(Table("run", "", t, {"pump": np.ones(600)}), 1)
+    table.columns["gauge"][[300, 301, 450, 451]] += 1.0
+    kept = case(loads(LEAKY), [table], catalogue(), Budget(80))
+    assert np.flatnonzero(np.isnan(kept.tables[0].columns["gauge"])).tolist() == [300, 301, 450, 451]

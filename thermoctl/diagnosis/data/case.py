@@ -15,7 +15,7 @@ from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
 from thermoctl.diagnosis.data.grids import Grid, grid
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.progress import Pace
-from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced
+from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced, switches
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.files.yamlfile import InputError
@@ -195,7 +195,7 @@ def case(
         d.y - model.run(d, values, np.zeros_like(dx0)).y
         for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)
     ]
-    tables, dropped = _without_outliers(tables, plant, null.residuals, as_stated, noise)
+    tables, dropped = _without_outliers(tables, plant, drives, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     kept = [np.where(np.isfinite(d.y), e, np.nan) for d, e in zip(drives, null.residuals, strict=True)]
     null = dataclasses.replace(null, residuals=kept)
@@ -303,17 +303,19 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
 def _without_outliers(
     tables: Sequence[Table],
     plant: Plant,
+    drives: Sequence[Excitation],
     residuals: Sequence[np.ndarray],
     as_stated: Sequence[np.ndarray],
     noise: Sequence[Noise],
 ) -> tuple[list[Table], Outliers]:
     """Return the recordings without cells whose residual is far from its neighbours', and these cells.
 
+    Where inputs switch, an error of several rows may be an answer to that. So may one at the end be.
     `as_stated`: residuals with the stated initial states. First readings that these predict are no outliers:
     their large residual is due to an initial state that the refit moved."""
     out, dropped = [], []
-    for t, e, stated in zip(tables, residuals, as_stated, strict=True):
-        columns = dict(t.columns)
+    for t, d, e, stated in zip(tables, drives, residuals, as_stated, strict=True):
+        columns, switched = dict(t.columns), any(switches(u).any() for u in d.u.T)
         for j, o in enumerate(plant.outputs.values()):
             index = np.flatnonzero(np.isfinite(e[:, j]))
             if len(index) < LEAST:
@@ -322,7 +324,9 @@ def _without_outliers(
             limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
             far = (np.abs(away) > limit) & ~predicted
-            odd = index[far & _lonely(e[index, j])]
+            lasts = ~_lonely(e[index, j])
+            lasts[:-1] &= switched  # nothing but a switch is answered so quickly
+            odd = index[far & ~lasts]
             if len(odd) and far.sum() < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan
@@ -334,8 +338,8 @@ def _without_outliers(
 def _lonely(e: np.ndarray) -> np.ndarray:
     """Return which values are farther from both neighbours than these are from each other.
 
-    An answer to a step lasts longer than a row. Before the first value the rig may have been anywhere, so its
-    neighbours are the next two. Beyond the last value the line through the two before it goes on."""
+    An answer to a switch of an input lasts longer than a row. The first value has the next two for
+    neighbours. Beyond the last one the line through the two before it goes on."""
     before, after = np.roll(e, 1), np.roll(e, -1)
     before[0], after[-1] = e[2], 3 * e[-2] - 2 * e[-3]
     away = np.minimum(np.abs(e - before), np.abs(e - after))

@@ -233,6 +233,12 @@ def _changes(d: Excitation, j: int, block: int) -> np.ndarray:
     return rows if not d.linear[j] and len(rows) <= len(d.t) // block else rows[:0]
 
 
+def switches(u: np.ndarray) -> np.ndarray:
+    """Return how far an input (N,) jumps after each row (N - 1,); 0 where its step is a usual one."""
+    step = np.abs(np.diff(u))
+    return np.where(step > OUTLIER * 1.4826 * np.median(step), step, 0.0)
+
+
 def _jumps(d: Excitation, block: int) -> np.ndarray:
     """Return the rows at which a block ends because an input jumps.
 
@@ -240,10 +246,7 @@ def _jumps(d: Excitation, block: int) -> np.ndarray:
     deviation of their input, until the share LOST of the rows is lost."""
     size = np.zeros(len(d.t) - 1)
     for u in d.u.T:
-        step = np.abs(np.diff(u))
-        size = np.maximum(
-            size, np.where(step > OUTLIER * 1.4826 * np.median(step), step, 0.0) / (np.std(u) or 1.0)
-        )
+        size = np.maximum(size, switches(u) / (np.std(u) or 1.0))
     size[: block - 1] = 0.0  # the first block is at the start
     most = int(LOST * len(d.t) / (0.5 * block))
     largest = np.argsort(-size, kind="stable")[:most]
