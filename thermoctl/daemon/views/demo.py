@@ -98,13 +98,20 @@ def _own(settings: Settings) -> Any:
     return load_settings(path)
 
 
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends the demo.
+
+    A KeyboardInterrupt may leave code that is executed from a string: so data classes are made in an import.
+    Python remembers that, and ends by SIGINT, though the exception was caught."""
+
+
 @contextlib.contextmanager
 def _stopped_by_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the demo as Ctrl-C does."""
 
     def interrupt(*_: Any) -> None:
-        """Raise KeyboardInterrupt, as Ctrl-C does."""
-        raise KeyboardInterrupt
+        """Raise Interrupted, which ends the demo as KeyboardInterrupt would."""
+        raise Interrupted
 
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {n: signal.signal(n, interrupt) for n in numbers}
