@@ -128,6 +128,34 @@ def test_what_is_left_of_the_best_meets_its_own_rivals(monkeypatch):
     assert s.best.fitted.hypothesis.keys == {("t", PLACE)}
 
 
+TREE = {"": {"g": 40.0}, "g": {"gr": 60.0}, "gr": {"grt": 80.0}, "gt": {"gst": 90.0}}
+
+
+@pytest.mark.parametrize("after", range(1, 10))
+def test_a_search_that_is_stopped_knows_that_something_was_left_out(monkeypatch, after):
+    """Stopped between two rounds, or before rivals were tried, a gain of a sensor was named at 1.0 (a cylinder)."""
+    order: list[Weighed] = []
+
+    def extensions(s, parent, looked):
+        """Return the known extensions of a hypothesis."""
+        order.append(parent)
+        known = TREE.get("".join(sorted(name for name, _ in parent.fitted.hypothesis.keys)), {})
+        return [weighed(k, score) for k, score in known.items()]
+
+    monkeypatch.setattr(beam, "extensions", extensions)
+    monkeypatch.setattr(beam, "screened", lambda *a: SimpleNamespace(norms=[], promised=[]))
+    monkeypatch.setattr(beam, "simplified", lambda s: [])
+    monkeypatch.setattr(beam, "cleared", lambda s: [])
+    monkeypatch.setattr(beam, "rebuilt", lambda s, rest, *a: weighed("".join(e.key[0] for e in rest), 50.0))
+    s = Search(SimpleNamespace(budget=Budget(99, stopped=lambda: len(order) >= after)), limits(), {})
+    s.keep([weighed("", 0.0)])
+    grow(s)
+    beam.swap(s)
+    whole = s.best.fitted.hypothesis.keys == weighed("gst", 0.0).fitted.hypothesis.keys
+    assert whole or s.case.budget.untried
+    assert after < 9 or not s.case.budget.untried
+
+
 @pytest.mark.parametrize(("promise", "tried"), [(30.0, True), (25.0, False)])
 def test_the_leading_effect_is_tried_where_it_promised_as_much(monkeypatch, promise, tried):
     monkeypatch.setattr(shortlist, "relabels", lambda candidate: False)

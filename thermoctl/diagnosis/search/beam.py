@@ -204,7 +204,7 @@ def grow(s: Search) -> None:
             s.case.budget.later = left
             if not s.extended(parent) and parent is first and not known:
                 parents = fewer  # the best cannot be extended: no rival with more effects is needed
-        if s.best.score <= first.score or s.case.budget.spent:
+        if s.best.score <= first.score:
             break
 
 
@@ -226,7 +226,10 @@ def swap(s: Search) -> None:
         # the rest of a single effect is the plant alone, which is extended first of all
         for e in effects if len(effects) > 1 or frozenset() not in s.seen else ():
             rest = tuple(o for o in effects if o is not e)
-            if s.case.budget.stopped() or frozenset(o.key for o in rest) in s.seen:
+            if frozenset(o.key for o in rest) in s.seen:
+                continue
+            if s.case.budget.stopped():
+                s.case.budget.untried += 1
                 continue
             parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
             if parent is None:
