@@ -28,7 +28,7 @@ from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
-from thermoctl.diagnosis.verdict.misfit import energies, standing, supported
+from thermoctl.diagnosis.verdict.misfit import deviations, energies, standing, supported
 from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
 from thermoctl.plant.language import Plant
 from thermoctl.recording.table import Table
@@ -109,8 +109,10 @@ def decided(sought: Sought) -> Diagnosis:
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
     chosen, posterior, asked = _chosen(sought, tried, physics)
-    null = with_residuals(known, closest(known, tried[frozenset()].fitted))
-    best = with_residuals(known, tried[chosen].fitted) if chosen else null
+    null = best = with_residuals(known, closest(known, tried[frozenset()].fitted))
+    if chosen:
+        best = with_residuals(known, tried[chosen].fitted)
+        best = replace(best, sd=deviations(best, energy, numbers))
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, sought.reserve)

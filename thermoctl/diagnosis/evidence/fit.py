@@ -136,27 +136,47 @@ def _one_does_not_stand(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) 
 def _none_stands(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
     """Return whether all amplitudes together are as near to no effect as one within SIGNIFICANT sd of it.
 
-    Storage and conductance of a hidden mass replace each other: each is uncertain, both are certain together.
-    So the square of their distance from no effect has the metric of their correlations. Where a parameter of
-    the plant replaces a large effect, all are uncertain. Then the likelihood without the effect tells, by
-    twice the log of their ratio (Wilks 1938), which does not depend on how the effect is parametrised."""
+    Where a parameter of the plant replaces a large effect, all are uncertain. Then the likelihood without the
+    effect tells, by twice the log of their ratio (Wilks 1938), which does not depend on how the effect is
+    parametrised."""
     enough = chdtri(len(sizes), chdtrc(1, SIGNIFICANT**2))
     known, likelihood = f.before or (None, 0.0)
     if known == f.hypothesis.keys - {e.key} and 2 * (f.log_likelihood - likelihood) >= enough:
         return False
-    columns = [q for q, r in f.fit.unknowns if r is None]
-    own = [e.own[p.name] for p in sizes]
-    if not set(own) <= set(columns):  # an amplitude for each recording
+    if _is_of_recordings(f, e, sizes):
         return all(_near_null(f, e, p) for p in sizes)
+    return _away(f, e, sizes) < enough
+
+
+def _is_of_recordings(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
+    """Return whether a parameter has a value for each recording."""
+    return any((e.own[p.name], None) not in f.fit.unknowns for p in sizes)
+
+
+def significance(f: Fitted, e: Placed) -> float:
+    """Return the square of the distance of an effect from none, in standard deviations of noise."""
+    effect = e.candidate.effect
+    fading = [p for p in effect.parameters if e.own.get(p.name) in f.sd and p.fades(effect.shapes)]
+    if _is_of_recordings(f, e, fading):
+        return max(_distance(f, e, p) ** 2 for p in fading)
+    return _away(f, e, fading)
+
+
+def _away(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> float:
+    """Return the square of the distance of parameters from no effect, in standard deviations.
+
+    Storage and conductance of a hidden mass replace each other: each is uncertain, both are certain together.
+    So the distance has the metric of their correlations."""
+    columns = [q for q, r in f.fit.unknowns if r is None]
     of_effects = {n for x in f.hypothesis.effects for n in x.own.values()}
     moves = np.array([q not in f.fit.at_bound or q in of_effects for q in columns])
     inverse = np.linalg.pinv(f.curvature[np.ix_(moves, moves)], hermitian=True)
-    at = [[q for q, m in zip(columns, moves, strict=True) if m].index(q) for q in own]
+    moving = [q for q, m in zip(columns, moves, strict=True) if m]
+    at = [moving.index(e.own[p.name]) for p in sizes]
     spread = inverse[np.ix_(at, at)]
     size = np.sqrt(np.maximum(np.diag(spread), TINY))
-    away = np.array([_distance(f, e, p) for p in sizes])
-    square = away @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ away
-    return bool(square < enough)
+    distance = np.array([_distance(f, e, p) for p in sizes])
+    return float(distance @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ distance)
 
 
 def _distance(f: Fitted, e: Placed, p: EffectParameter) -> float:

@@ -11,6 +11,9 @@ deviations of all readings together,
     share = 1 - (1 - alike)^parameters,   odds of physics = sqrt(2 pi) exp(r^2 / 2) / (r DECADES ln 10)
 
 Energies are mean squares of an output's residuals over its sensor's noise.
+
+The standard deviations of a refit are those of the noise. With z, the effect's size in these, noise and
+misfit together give standard deviations that are sqrt(1 + z^2 / r^2) times as large (`deviations`).
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted
+from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted, significance
 from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.hypothesis.candidates import Key
 from thermoctl.diagnosis.limits import Thresholds
@@ -64,9 +67,7 @@ def standing(
     for home in sorted(energy, key=len):
         mine, own = energy[home], {}
         for key in home:
-            part = (e for keys, e in energy.items() if keys < home and key not in keys)
-            without = min(part, key=lambda e: e.all)
-            own[key] = physics(without, mine, 1 - (1 - limits.alike) ** dims[key])
+            own[key] = physics(_without(energy, home, key), mine, _share(dims[key], limits))
         stand = standouts(own)
         if stand in simpler or any(_is_simpler(home, key, energy, dims, contains, limits) for key in home):
             simpler.add(home)
@@ -92,7 +93,17 @@ def _is_simpler(
     if other is None or simple in home:
         return False
     more = max(dims[key] - dims[simple], 1)
-    return physics(other, energy[home], 1 - (1 - limits.alike) ** more) <= MISFIT
+    return physics(other, energy[home], _share(more, limits)) <= MISFIT
+
+
+def _share(dims: int, limits: Thresholds) -> float:
+    """Return the share of the energy that stays along `dims` parameters."""
+    return 1 - (1 - limits.alike) ** dims
+
+
+def _without(energy: Mapping[frozenset[Key], Energy], home: frozenset[Key], key: Key) -> Energy:
+    """Return the energy of the best tried hypothesis without an effect, whose effects are a subset."""
+    return min((e for keys, e in energy.items() if keys < home and key not in keys), key=lambda e: e.all)
 
 
 def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
@@ -118,14 +129,29 @@ def supported(
 
 def physics(without: Energy, beside: Energy, share: float) -> float:
     """Return the probability that an effect is physics, from the energies without it and beside it."""
-    if not any(beside.misfit):
-        return 1.0
-    removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
-    variance = share * np.count_nonzero(left) * left + 1 / np.array(beside.rows)
-    square = float(np.clip((removed / variance).sum(), 0.0, SURE))
+    square = float(np.clip(_square(without, beside, share), 0.0, SURE))
     r = max(np.sqrt(square), 1.0)
     odds = np.sqrt(2 * np.pi) * np.exp(0.5 * square) / (r * DECADES * np.log(10.0))
     return float(odds / (1 + odds))
+
+
+def _square(without: Energy, beside: Energy, share: float) -> float:
+    """Return r^2; infinite where no misfit stays."""
+    removed, left = np.subtract(without.squares, beside.squares), np.array(beside.misfit)
+    if not left.any():
+        return np.inf
+    variance = share * np.count_nonzero(left) * left + 1 / np.array(beside.rows)
+    return float((removed / variance).sum())
+
+
+def deviations(f: Fitted, energy: Mapping[frozenset[Key], Energy], limits: Thresholds) -> Mapping[str, float]:
+    """Return the standard deviations of the effects' parameters, noise and misfit together."""
+    home, sd = f.hypothesis.keys, dict(f.sd)
+    for e in f.hypothesis.effects:
+        square = _square(_without(energy, home, e.key), energy[home], _share(len(e.own), limits))
+        stretch = np.sqrt(1 + significance(f, e) / max(square, 1.0))
+        sd |= {n: sd[n] * stretch for n in e.own.values() if n in sd}
+    return sd
 
 
 def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[frozenset[Key], Energy]:
