@@ -198,11 +198,6 @@ RULES: Mapping[str, Rule] = {
         {"law.signals._follows": _no},
         searches=True,
     ),
-    "noise": Rule(
-        "an unread column that may be white noise is no signal",
-        {"hypothesis.rig._is_noise": _no},
-        searches=True,
-    ),
     "half": Rule("a promise may be doubled", {"search.beam.HALF": 1.0}, searches=True),
     "pays": Rule(
         "beside one effect that leaves only noise, laws compete only where a free function pays for one",

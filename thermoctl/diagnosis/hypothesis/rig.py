@@ -31,9 +31,6 @@ MOVING = ("velocity", "rotation")
 FLOWING = ("volume flow", "mass flow")
 # Kinds by unit of a node that structure makes a velocity, and of its position.
 RATES, PLACES = ("", *MOVING, *FLOWING, "voltage"), ("", "length", "voltage")
-# Von Neumann's ratio of white noise is 2, with a standard deviation of 2 / sqrt(n). A column may be noise if
-# its ratio is at most so many of these below. However few its rows are, noise has to be half of its variance.
-WHITE, HALF = 3.0, 1.0
 JUMP = 3  # longest duration of a sudden change, in samples: a filter before the recording may spread it
 # Patterns by which the name of a column that the plant does not read is taken for v, x, i or T. The result
 # has a note about each guess.
@@ -112,13 +109,6 @@ def _motions(plant: Plant) -> dict[str, str]:
     }
 
 
-def _is_noise(parts: Sequence[np.ndarray]) -> bool:
-    """Return whether values may be white noise, by the ratio of von Neumann (1941)."""
-    steps = sum(float(np.sum(np.diff(v) ** 2)) for v in parts)
-    squares = sum(float(np.sum((v - v.mean()) ** 2)) for v in parts)
-    return steps > max(2.0 - WHITE * 2.0 / np.sqrt(sum(map(len, parts))), HALF) * squares
-
-
 def _is_clock(d: Excitation, column: np.ndarray) -> bool:
     """Return whether a column is the recording's time, from any zero and in any unit."""
     if len(column) != len(d.t) or len(d.t) < 3 or not np.isfinite(column).all():
@@ -178,7 +168,7 @@ class Rig:
         self.air = min(count, key=lambda i: (-count[i], self._mean(i)), default=None)
 
     def _unread(self) -> list[str]:
-        """Return the columns that move in every recording, beyond noise, and are no part of the plant."""
+        """Return the columns that move in every recording and are no part of the plant."""
         p = self.physics
         common = set.intersection(*(set(c) for c in self.columns)) if self.columns else set()
         read = {i.column for i in p.inputs.values()} | {o.column for o in p.outputs.values()}
@@ -188,8 +178,7 @@ class Rig:
             for c in common - read - known
             if all(np.isfinite(t[c]).any() and np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in self.columns)
         ]
-        moving = [c for c in moving if not all(map(_is_clock, self.drives, (t[c] for t in self.columns)))]
-        return [c for c in moving if not _is_noise([t[c][np.isfinite(t[c])] for t in self.columns])]
+        return [c for c in moving if not all(map(_is_clock, self.drives, (t[c] for t in self.columns)))]
 
     def kind(self, q: Input | Node | Output) -> str:
         """Return the kind of a quantity: from its role, its motion, the node that it reads, or its unit."""

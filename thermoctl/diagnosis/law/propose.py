@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +46,7 @@ POOL = 60  # number of terms from which sums of terms are built
 PAIRED = 600  # number of terms that are tried two at a time
 PAIRS, LIKELY = 24, 50_000  # number of pairs that are kept; number of best pairs among which they are sought
 GROWN = 8  # number of pairs, those with the best score, to which a third term is added
-# Number of proposals in all; of those with one term, by score; of those with one term and different signals.
+# Number of proposals of either kind; of those with one term, by score; of those with different signals.
 PROPOSALS, SINGLE, SIGNALS = 14, 5, 4
 TERMS = 3
 # Number of terms whose shapes are searched more finely; of finer grids; of values of each shape in them.
@@ -118,28 +119,60 @@ class Found:
 
 
 def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposal]:
-    """Return the most promising laws, best first. Raises SimulationError."""
+    """Return the most promising laws, best first. Raises SimulationError.
+
+    Laws of unread columns take no turn from the others: the best of both kinds come one by one."""
     rig, where, linear = linearised(case, parent)
     combos = choices(rig, where, linear.likely[:NODES], linear)
-    pool = _terms(rig, linear, ranked(linear, combos), COMBINATIONS)
-    base = log_number(combos), limits
-    out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
-    for place in dict.fromkeys(f.place for f in pool):
-        out += _sums(linear, place, [f for f in pool if f.place == place], base)
-    out.sort(key=lambda p: -p.score)
-    return _mixed(out)
+    base, pool, kinds = (log_number(combos), limits), list[Found](), list[list[Proposal]]()
+    for part, new in _in_turn(rig, combos):
+        pool = _best_first([*pool, *_terms(rig, linear, ranked(linear, part), COMBINATIONS, new)])
+        out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
+        for place in dict.fromkeys(f.place for f in pool):
+            out += _sums(linear, place, [f for f in pool if f.place == place], base)
+        out.sort(key=lambda p: -p.score)
+        kinds.append(_mixed([p for p in out if not new or _reads(p.terms, new)]))
+    kinds.sort(key=lambda ps: -max((p.score for p in ps), default=-np.inf))
+    return [p for ps in itertools.zip_longest(*kinds) for p in ps if p]
 
 
-def _terms(rig: Rig, linear: Tracked, free: Sequence[tuple[float, Place, Signal]], count: int) -> list[Found]:
-    """Return terms over the first `count` of ranked places and signals, the best first."""
+def _in_turn(
+    rig: Rig, combos: Sequence[tuple[Place, Signal]]
+) -> list[tuple[list[tuple[Place, Signal]], AbstractSet[str]]]:
+    """Return the places and signals without unread columns, and then all, with the unread columns in them."""
+    spare = {*rig.spare}
+    read = [(p, s) for p, s in combos if s.label not in spare]
+    new = {s.label for _, s in combos} & spare
+    return [(read, set()), ([*combos], new)] if new else [(read, set())]
+
+
+def _reads(terms: Sequence[Term | Family], columns: AbstractSet[str]) -> bool:
+    """Return whether a term has one of these columns as a signal."""
+    return any(s.label in columns for t in terms for s in t.signals)
+
+
+def _best_first(pool: Sequence[Found]) -> list[Found]:
+    return sorted(pool, key=lambda f: -f.gain)
+
+
+def _terms(
+    rig: Rig,
+    linear: Tracked,
+    free: Sequence[tuple[float, Place, Signal]],
+    count: int,
+    new: AbstractSet[str] = frozenset(),
+) -> list[Found]:
+    """Return terms over the first `count` of ranked places and signals, the best first.
+
+    `new`: columns of which each term reads one; any term without them."""
     pool: list[Found] = []
     for place in dict.fromkeys(p for _, p, _ in free[:count]):
         first = [s for _, p, s in free[:count] if p == place]
         own = [s for _, p, s in free if p == place]
         every = [*own[:SECOND], *rates(rig, place, linear.metric.signals, own)]
-        pool += _singles(linear, place, first, every)
-    pool.sort(key=lambda f: -f.gain)
-    return sorted([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])], key=lambda f: -f.gain)
+        pool += _singles(linear, place, first, every, new)
+    pool = _best_first(pool)
+    return _best_first([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])])
 
 
 def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[Proposal, Proposal]]:
@@ -158,25 +191,34 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     combos = [
         (p, s) for n in best if (p := Place(n)) in where for s in signals(rig, p, linear.metric.signals)
     ]
-    base = log_number(combos), limits
-    each = []
-    for n, other in (best, best[::-1]):
-        beside = linear.beside(other, couples[best][1])
-        free = ranked(beside, [c for c in combos if c[0] == Place(n)])
-        each.append(
-            [f for f in _varied(_terms(rig, beside, free, EACH)) if len(f.term.form.sizes) == 1][:EACH]
-        )
-    out = []
-    for a, b in itertools.product(*each):
-        x = [linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)]
-        promise, c = predicted(linear, np.concatenate(x, axis=1))
-        promise -= cost_of(linear, len(c) + sum(len(f.term.form.shapes) for f in (a, b)))
-        laws = (
-            Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), c, strict=True)
-        )
-        out.append((next(laws), next(laws)))
+    base, out = (log_number(combos), limits), list[tuple[Proposal, Proposal]]()
+    for part, new in _in_turn(rig, combos):
+        each = []
+        for n, other in (best, best[::-1]):
+            beside = linear.beside(other, couples[best][1])
+            free = ranked(beside, [c for c in part if c[0] == Place(n)])
+            single = [f for f in _varied(_terms(rig, beside, free, EACH)) if len(f.term.form.sizes) == 1]
+            each.append(single[:EACH])
+        both = [p for p in itertools.product(*each) if not new or _reads([f.term for f in p], new)]
+        out += _couples([_couple(linear, a, b, base) for a, b in both])
+    return out
+
+
+def _couple(linear: Tracked, a: Found, b: Found, base: tuple[float, Thresholds]) -> tuple[Proposal, Proposal]:
+    """Return two laws at two places, each with the promise of both together."""
+    x = np.concatenate([linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)], axis=1)
+    promise, sizes = predicted(linear, x)
+    promise -= cost_of(linear, len(sizes) + sum(len(f.term.form.shapes) for f in (a, b)))
+    first, second = (
+        Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), sizes, strict=True)
+    )
+    return first, second
+
+
+def _couples(pairs: Sequence[tuple[Proposal, Proposal]]) -> list[tuple[Proposal, Proposal]]:
+    """Return the best COUPLES pairs, at most SHARED of them with the same law."""
     kept, held = list[tuple[Proposal, Proposal]](), Counter[Any]()
-    for pair in sorted(out, key=lambda p: p[0].cost + p[1].cost - p[0].promise):
+    for pair in sorted(pairs, key=lambda p: p[0].cost + p[1].cost - p[0].promise):
         if all(held[p.kind] < SHARED for p in pair):
             kept.append(pair)
             held.update(p.kind for p in pair)
@@ -193,13 +235,15 @@ def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
     return rig, where, tracked(case, parent, entered(case, parent, where, TRACKED))
 
 
-def _singles(linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal]) -> list[Found]:
-    """Return the terms at a place, the best KEPT of each form over each signal."""
+def _singles(
+    linear: Tracked, place: Place, first: Sequence[Signal], every: Sequence[Signal], new: AbstractSet[str]
+) -> list[Found]:
+    """Return the terms at a place, the best KEPT of each form over each signal. `new`: as in `_terms`."""
     still = linear.columns(place, linear.along(lambda run, t: np.ones((len(t), 1))))
     duration = max(float(d.t[-1]) for d in linear.metric.drives)
     sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
-    tried = families(first, every, duration, sample)
+    tried = [f for f in families(first, every, duration, sample) if not new or _reads((f,), new)]
     if place.part == "storage":
         tried = [f for f in tried if not f.form.memory]  # a capacity remembers nothing
     for part in chunks(tried, lambda f: f.count, CHUNK):

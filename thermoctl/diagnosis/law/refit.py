@@ -143,7 +143,7 @@ def affordable(case: Case, parent: Fitted) -> int:
     rows = sum(len(t) for t in case.tables)
     model = parent.rough.model
     numbers = rows * len(model.states) * (len(model.unknowns) + 1)
-    return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, PROPOSALS + SIMPLER))
+    return int(np.clip(NUMBERS / max(numbers, 1), FEWEST_REFITS, 2 * PROPOSALS + SIMPLER))
 
 
 def law_rate(f: Fitted, law: PlacedLaw) -> ex.Expr:
