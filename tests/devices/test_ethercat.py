@@ -210,6 +210,30 @@ def test_a_slave_that_leaves_op_comes_back_while_the_other_goes_on(cables, tmp_p
 
 
 @wire
+def test_a_disarm_does_not_wait_for_a_slave_that_is_brought_back(cables, tmp_path, monkeypatch):
+    """The drive's own watchdog is longer than the test: only the disarm can stop it."""
+    monkeypatch.setattr(bus, "LOST_FRAMES", 1000)
+    cable = cables(Drive, Terminal)
+    with Rig(
+        tmp_path, f"[{drive(cable, watchdog_s=5.0)}, {terminal(cable, more=', stale_after_s: 0.3')}]"
+    ) as rig:
+        rig.drive, rig.enable = 0.2, True
+        rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
+        cable.ask(2, "stuck", SAFEOP)
+        cable.ask(2, "fail", SAFEOP, 0x1A)
+        rig.until(lambda: rig.status("coil_c") == "STALE")
+        worst_s = 0.0
+        for phase in range(4):
+            cycles(rig, cable, 100 + 50 * phase)
+            rig.enable, start_s = False, time.monotonic()
+            rig.until(lambda: cable.ask(1, "output") == 0)
+            worst_s = max(worst_s, time.monotonic() - start_s)
+            rig.enable = True
+            rig.until(lambda: cable.ask(1, "output") == 100)
+        assert worst_s < bus.UP_S / 4
+
+
+@wire
 def test_a_drive_that_lost_its_power_is_set_up_again_and_stays_off(cables, tmp_path):
     cable = cables(Drive, Terminal)
     with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable)}]") as rig:

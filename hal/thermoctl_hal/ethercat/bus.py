@@ -10,8 +10,8 @@ runs the cycle, beside the loop.
                                   with every slave in OP the frame does not count
     LOST_FRAMES lost in a row     the link is lost
 
-The first device that connects brings every slave to OP. A slave that is lost later comes back alone, while
-the others stay in the cycle.
+The first device that connects brings every slave to OP. A slave that is lost later comes back alone, by
+a thread, while the others stay in the cycle.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, wait
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -51,6 +52,8 @@ class EthercatBus:
         self._master: Any = None
         self._claim: socket.socket | None = None
         self._missing, self._check_s, self._timeout_us = 0, 0.0, 0
+        self._back: tuple[int, Future[None]] | None = None
+        self._ending = threading.Event()
 
     def slave(self, position: int) -> Any:
         """Return a slave of the open master."""
@@ -67,13 +70,16 @@ class EthercatBus:
             self._timeout_us = round(US * max(s.spec.timeout_s for s in self.described.values()))
             self._open()
         else:
-            self._revive(position)
+            self._bring_back(position)
         self.users.add(position)
 
     def leave(self, position: int) -> None:
         """End the use of a slave; its last user sends every slave to INIT and closes the interface."""
         self.users.discard(position)
         if not self.users and self._master is not None:
+            if self._back is not None:
+                self._ending.set()  # the thread uses the master that is closed below
+                wait([self._back[1]])
             with contextlib.suppress(Exception):  # the link may be gone
                 self._master.state = INIT
                 self._master.write_state()
@@ -122,6 +128,8 @@ class EthercatBus:
             claim.close()
 
     def _open(self) -> None:
+        self._back = None
+        self._ending.clear()
         self._start()
         try:
             self._configure()
@@ -189,11 +197,12 @@ class EthercatBus:
             self._master.read_state()
             if self.slave(position).state == state:
                 return
-            if self.slave(position).state & ERROR or time.monotonic() > end:
+            is_over = time.monotonic() > end or self._ending.is_set()
+            if self.slave(position).state & ERROR or is_over:
                 raise HardwareError(
                     f"{self.interface}: {self.problem(position)}, {NAMES[state]} was expected"
                 )
-            if state == OP:
+            if state == OP and self._back is None:  # else the poller runs the cycles
                 self.exchange()
             time.sleep(0.001)
 
@@ -236,6 +245,22 @@ class EthercatBus:
             f"slave {position} is in {name} with error 0x{code:04X} ({pysoem.al_status_code_to_string(code)})"
         )
 
+    def _bring_back(self, position: int) -> None:
+        """Start to bring a slave back, or end it when it is in OP. Raises HardwareError until then.
+
+        It takes seconds, in which the other slaves need their commands: a thread does it, one slave at a
+        time. The master locks its frames; it is made for such a thread beside the cycle."""
+        if self._back is None:
+            done: Future[None] = Future()
+            self._back = position, done
+            threading.Thread(target=_settle, args=(done, self._revive, position), daemon=True).start()
+        busy, done = self._back
+        if busy != position or not done.done():
+            raise HardwareError(f"{self.interface}: slave {busy} is being brought back")
+        self._back = None
+        done.result()
+        self.sick.discard(position)
+
     def _revive(self, position: int) -> None:
         """Bring a slave back to OP: after an error, a broken cable or a restart. Raises HardwareError."""
         slave = self.slave(position)
@@ -254,7 +279,15 @@ class EthercatBus:
         self._check(position)
         self._request(position, OP)
         self._reach(position, OP)
-        self.sick.discard(position)
+
+
+def _settle(done: Future[None], act: Callable[[int], None], position: int) -> None:
+    try:
+        act(position)
+    except BaseException as e:  # the poller raises it at its next attempt
+        done.set_exception(e)
+    else:
+        done.set_result(None)
 
 
 def _reason(error: Any) -> str:
