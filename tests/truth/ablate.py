@@ -117,7 +117,10 @@ RULES: Mapping[str, Rule] = {
     "confirmed": Rule(
         "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
     ),
-    "event": Rule("beside a misfit an event needs another recording", {"verdict.confirm._timed": _no}),
+    "event": Rule(
+        "beside a misfit an event needs another recording",
+        {"verdict.confirm.timed": _no, "diagnose.timed": _no},
+    ),
     "only noise": Rule(
         "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
     ),

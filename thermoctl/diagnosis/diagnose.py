@@ -25,7 +25,7 @@ from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
-from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed
+from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, timed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
 from thermoctl.diagnosis.verdict.misfit import deviations, energies, standing, supported
@@ -176,12 +176,15 @@ def _chosen(
     chosen = supported(likeliest, physics)  # the other effects are part of the remainder
     if chosen not in tried:
         chosen = likeliest
-    # beside known physics whose residual is only noise, there is no misfit that it could imitate
     best = tried[chosen].fitted
-    quiet = only_noise(known, best, numbers) and not any(key[0] == LAW for key in chosen)
+    # straight lines between rows know only how late switches are on average: an event may be one of them
+    late = any(i.linear and not i.stated for i in known.plant.inputs.values())
+    unsure = [key for key in chosen if key[0] == LAW or late and timed(best, key)]
+    # beside known physics whose residual is only noise, there is no misfit that it could imitate
+    quiet = only_noise(known, best, numbers) and not unsure
     if sought.reserve or not quiet:
         fits = {keys: w.fitted for keys, w in tried.items()}
-        misfit = max(over_noise(known, best)) > numbers.clean
+        misfit = late or max(over_noise(known, best)) > numbers.clean
         found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve, misfit), numbers.name)
         if found[0] == chosen or not quiet:
             return found

@@ -137,7 +137,7 @@ class Blocks:
         return out
 
 
-def _timed(f: Fitted, key: Key) -> Candidate | None:
+def timed(f: Fitted, key: Key) -> Candidate | None:
     """Return an effect if it depends on the time itself."""
     timed = (e.candidate for e in f.hypothesis.effects if e.key == key and e.candidate.effect.timed)
     return next(timed, None)
@@ -177,7 +177,7 @@ class Confirm:
 
         An event has a course in time, as a misfit has. Parts of one recording cannot tell them apart, only
         another recording can that the event is in, too."""
-        event = None if self.reserve or not self.misfit else _timed(self.tried[home], key)
+        event = None if self.reserve or not self.misfit else timed(self.tried[home], key)
         if event and (len(self.case.tables) < ACROSS or not event.shared):
             return UNTOLD
         mine = self._log_energies(home, event is not None)
