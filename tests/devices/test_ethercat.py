@@ -4,6 +4,7 @@ Shown: values and faults of a terminal; a drive that follows, stops and is not e
 in which the link or a slave fails, and the way back.
 """
 
+import contextlib
 import math
 import sys
 import time
@@ -178,12 +179,15 @@ def test_a_wrong_working_counter_does_not_count_as_a_reading(cables, tmp_path):
         rig.until(lambda: rig.status("coil_c") == "OK")
 
 
-@wire
-@pytest.mark.parametrize("way", ["error", "power", "away"])
-def test_a_slave_that_leaves_op_comes_back_while_the_other_goes_on(cables, tmp_path, monkeypatch, way):
-    """An error of its state machine; a short loss of power; a terminal that is taken out and put back.
+WAYS = pytest.mark.parametrize("way", ["error", "power", "away"])
 
-    On a busy machine the slaves miss three frames in a row; then the link counts as lost, and the drive stops."""
+
+@contextlib.contextmanager
+def beside_a_lost_terminal(cables, tmp_path, monkeypatch, way):
+    """Yield the cable and the rig of a drive at 100 counts, whose neighbour is lost.
+
+    An error of its state machine; a short loss of power; a terminal that is taken out and put back. On a busy
+    machine the slaves miss three frames in a row; then the link counts as lost, and the drive stops."""
     monkeypatch.setattr(bus, "LOST_FRAMES", 1000)
     cable = cables(Drive, Terminal)
     with Rig(
@@ -198,6 +202,13 @@ def test_a_slave_that_leaves_op_comes_back_while_the_other_goes_on(cables, tmp_p
             cable.ask(2, "power_on")
             cable.ask(2, "present", False)
         rig.until(lambda: rig.status("coil_c") == "STALE")
+        yield cable, rig
+
+
+@wire
+@WAYS
+def test_a_slave_that_leaves_op_comes_back_while_the_other_goes_on(cables, tmp_path, monkeypatch, way):
+    with beside_a_lost_terminal(cables, tmp_path, monkeypatch, way) as (cable, rig):
         assert "slave 2" in problem(rig, "coil_c")
         # a slow machine may make the drive's reading stale for a moment, too: it has to be fresh again
         rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("amplifier_state") == "OK")
@@ -210,18 +221,10 @@ def test_a_slave_that_leaves_op_comes_back_while_the_other_goes_on(cables, tmp_p
 
 
 @wire
-def test_a_disarm_does_not_wait_for_a_slave_that_is_brought_back(cables, tmp_path, monkeypatch):
+@WAYS
+def test_a_disarm_does_not_wait_for_a_slave_that_is_brought_back(cables, tmp_path, monkeypatch, way):
     """The drive's own watchdog is longer than the test: only the disarm can stop it."""
-    monkeypatch.setattr(bus, "LOST_FRAMES", 1000)
-    cable = cables(Drive, Terminal)
-    with Rig(
-        tmp_path, f"[{drive(cable, watchdog_s=5.0)}, {terminal(cable, more=', stale_after_s: 0.3')}]"
-    ) as rig:
-        rig.drive, rig.enable = 0.2, True
-        rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
-        cable.ask(2, "stuck", SAFEOP)
-        cable.ask(2, "fail", SAFEOP, 0x1A)
-        rig.until(lambda: rig.status("coil_c") == "STALE")
+    with beside_a_lost_terminal(cables, tmp_path, monkeypatch, way) as (cable, rig):
         worst_s = 0.0
         for phase in range(4):
             cycles(rig, cable, 100 + 50 * phase)

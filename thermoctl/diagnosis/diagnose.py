@@ -177,7 +177,7 @@ def _chosen(
     if chosen not in tried:
         chosen = likeliest
     best = tried[chosen].fitted
-    # straight lines between rows know only how late switches are on average: an event may be one of them
+    # straight lines between rows know only how late switches are on average: an event may be one late switch
     late = any(i.linear and not i.stated for i in known.plant.inputs.values())
     unsure = [key for key in chosen if key[0] == LAW or late and timed(best, key)]
     # beside known physics whose residual is only noise, there is no misfit that it could imitate

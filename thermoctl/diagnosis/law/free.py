@@ -61,6 +61,7 @@ def choices(
     links = [{f.source, f.target} for f in rig.physics.flows.values()]
 
     def explains(p: Place) -> bool:
+        """Return whether a law at a place may explain something at the nodes."""
         new = p.source and not p.flows and {*p.nodes} not in links
         return {*p.nodes} <= {*nodes} if new else bool({*p.nodes} & {*nodes})
 

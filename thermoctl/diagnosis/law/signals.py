@@ -199,6 +199,7 @@ def rates(rig: Rig, place: Place, runs: Sequence[Values], beside: Sequence[Signa
     known = [_values(s.value, runs) for s in beside]
 
     def alike(rate: Expr) -> bool:
+        """Return whether a known signal is in proportion to a flow."""
         v = _values(rate, runs)
         return any(abs(v @ w) > ALIKE * np.linalg.norm(v) * np.linalg.norm(w) for w in known)
 

@@ -139,8 +139,8 @@ class Blocks:
 
 def timed(f: Fitted, key: Key) -> Candidate | None:
     """Return an effect if it depends on the time itself."""
-    timed = (e.candidate for e in f.hypothesis.effects if e.key == key and e.candidate.effect.timed)
-    return next(timed, None)
+    mine = (e.candidate for e in f.hypothesis.effects if e.key == key)
+    return next((c for c in mine if c.effect.timed), None)
 
 
 def _squares(sums: np.ndarray, step: np.ndarray) -> np.ndarray:
