@@ -18,10 +18,10 @@ from thermoctl.diagnosis.evidence.held_out import Worth, rms_of
 from thermoctl.diagnosis.evidence.levels import late
 from thermoctl.diagnosis.evidence.unknown import Left
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, spoken
+from thermoctl.diagnosis.hypothesis.places import flow_unit
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.refit import PlacedLaw, equation, laws_of
 from thermoctl.diagnosis.law.result import law_entry, wrong_ends
-from thermoctl.diagnosis.law.smooth import flow_unit
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.report.words import listed
 from thermoctl.diagnosis.search.beam import Searched, Weighed

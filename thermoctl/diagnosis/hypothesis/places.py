@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -38,18 +38,45 @@ def _nodes(which: Iterable[str], symbol: str) -> Iterator[Place]:
         yield Place(n, {symbol: name(n)}, {symbol: n})
 
 
-def _storing(rig: Rig) -> list[str]:
+def storing(rig: Rig) -> list[str]:
     """Return the nodes that are ends of flows and store something; a position does not."""
     ends = {e for f in rig.physics.flows.values() for e in (f.source, f.target)}
     return [n for n in rig.physics.nodes if n in ends and n not in rig.position_of.values()]
 
 
-def _exchanging(rig: Rig) -> Iterator[Place]:
-    nodes = set(_storing(rig))
-    for f in rig.physics.flows.values():
-        if f.source in nodes and f.target in nodes:
-            ends = {"m": str(f.source), "n": str(f.target)}
-            yield Place(f"{f.source}-{f.target}", {k: name(v) for k, v in ends.items()}, ends)
+def exchanging(rig: Rig) -> list[tuple[str, str]]:
+    """Return the pairs of nodes that may exchange what they hold.
+
+    Flows link them, also through others. Or they have one unit, and their flows one unit, too: chambers
+    leak."""
+    nodes = storing(rig)
+    flows = rig.physics.flows.values()
+    pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
+    kinds = {n: (rig.physics.nodes[n].unit, flow_unit(rig.physics, n)) for n in nodes}
+    for a, b in combinations(nodes, 2):
+        alike = kinds[a] == kinds[b] and all(kinds[a])
+        if (b, a) not in pairs and (alike or b in _linked(a, pairs)):
+            pairs.add((a, b))
+    return sorted(pairs)
+
+
+def _linked(node: str, pairs: Collection[tuple[str, str]]) -> set[str]:
+    """Return the nodes that pairs link to a node, directly or through others."""
+    found, new = set[str](), {node}
+    while new:
+        found |= new
+        new = {n for pair in pairs if found & {*pair} for n in pair} - found
+    return found
+
+
+def flow_unit(plant: Plant, node: str) -> str | None:
+    """Return the unit of the flows at a node, None where none is stated."""
+    return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
+
+
+def _node_pairs(rig: Rig) -> Iterator[Place]:
+    for m, n in exchanging(rig):
+        yield Place(f"{m}-{n}", {"m": name(m), "n": name(n)}, {"m": m, "n": n})
 
 
 def _conductances(rig: Rig) -> Iterator[Place]:
@@ -297,7 +324,7 @@ def _free(rig: Rig, e: Expr) -> bool:
 
 def _fixed_nodes(rig: Rig) -> Iterator[Place]:
     """Yield nodes whose storage has no free parameter, except a storage of 1: dn/dt = sum of flows."""
-    storages = {n: rig.physics.nodes[n].storage for n in _storing(rig)}
+    storages = {n: rig.physics.nodes[n].storage for n in storing(rig)}
     yield from _nodes((n for n, e in storages.items() if e is not ex.ONE and not _free(rig, e)), "T")
 
 
@@ -305,7 +332,7 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
     """Yield flows that depend on their own node, and that have no free parameter."""
     for f in rig.physics.flows.values():
         ends = {e for e in (f.source, f.target) if e}
-        if ends & ex.names(f.rate) & set(_storing(rig)) and not _free(rig, f.rate):
+        if ends & ex.names(f.rate) & set(storing(rig)) and not _free(rig, f.rate):
             yield Place(f.name, {}, flow=f.name)
 
 
@@ -313,8 +340,8 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 ERRORS = ("sensor", "body_sensor", "passive_sensor", "recorded_input", "position_sensor")
 FAULTS = (*ERRORS, "reading_in_air")  # places that a trusted reading is not (`Plant.trusts`)
 PLACES = {
-    "node": lambda rig: _nodes(_storing(rig), "n"),
-    "node_pair": _exchanging,
+    "node": lambda rig: _nodes(storing(rig), "n"),
+    "node_pair": _node_pairs,
     "temperature_node": lambda rig: _nodes(rig.temperatures, "T"),
     "velocity_node": lambda rig: _nodes(rig.velocities, "v"),
     "conductance": _conductances,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
+from thermoctl.diagnosis.hypothesis.places import exchanging, storing
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, Rig, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
@@ -88,27 +88,11 @@ class Signal:
 def places(rig: Rig) -> list[Place]:
     """Return the places of laws: flows into and between nodes, storages, and conversions.
 
-    Nodes that flows link, also through others, hold the same: between any two of them there may be one more.
-    A position is no such node. A storage of 1 is a definition: dn/dt is the sum of the flows."""
-    positions = set(rig.pairs.values())
-    flows = rig.physics.flows.values()
-    nodes = [
-        n for n in rig.physics.nodes if n not in positions and any(n in (f.source, f.target) for f in flows)
-    ]
-    pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
-    pairs |= {p for p in combinations(nodes, 2) if p[::-1] not in pairs and p[1] in _linked(p[0], pairs)}
+    A storage of 1 is a definition: dn/dt is the sum of the flows."""
+    nodes = storing(rig)
     stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
     joined = conversions(rig.physics, nodes)
-    return [*map(Place, nodes), *(Place(b, a) for a, b in sorted(pairs)), *stored, *joined]
-
-
-def _linked(node: str, pairs: Collection[tuple[str, str]]) -> set[str]:
-    """Return the nodes that pairs link to a node, directly or through others."""
-    found, new = set[str](), {node}
-    while new:
-        found |= new
-        new = {n for pair in pairs if found & {*pair} for n in pair} - found
-    return found
+    return [*map(Place, nodes), *(Place(b, a) for a, b in exchanging(rig)), *stored, *joined]
 
 
 def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:

@@ -25,6 +25,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.noise import Around
 from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
+from thermoctl.diagnosis.hypothesis.places import flow_unit
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
 from thermoctl.diagnosis.law.signals import Place, Values
 from thermoctl.diagnosis.search.metric import Absorbed, Metric, Plain, Pushed
@@ -330,11 +331,6 @@ def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
     except (SimulationError, np.linalg.LinAlgError):
         return None
     return float(np.sqrt(np.mean(np.concatenate([run[f"{LATENT}{node}"] for run in runs]) ** 2)))
-
-
-def flow_unit(plant: Plant, node: str) -> str | None:
-    """Return the unit of the flows at a node, None where none is stated."""
-    return next((f.unit for f in plant.flows.values() if node in (f.source, f.target) and f.unit), None)
 
 
 def law_unit(plant: Plant, place: Place) -> str | None:
