@@ -232,6 +232,17 @@ def test_an_expression_that_nothing_converts(right, wrong, words, tmp_path, caps
     assert len(stated) == 1 and stated[0].severe == (wrong == "value: p,")
 
 
+@pytest.mark.parametrize("power", [3.0, 8.0])
+def test_watts_that_are_kilowatts_beside_missing_physics(power):
+    """An unknown source hid the mistake that the plant file shows: it was diagnosed, and two laws were named."""
+    source = f"  sun: {{into: two, rate: {power} * step(t - 500), unit: W}}\noutputs:"
+    _, table = rig(TWO, text=PLANTS[TWO].replace("outputs:", source))
+    table = column("heat", lambda v: 1e-3 * v)(table)
+    found = checks(loads(PLANTS[TWO].replace("heat: {unit: W}", "heat: {unit: kW}")), [table])
+    assert [f.kind for f in found if f.severe] == ["unit"]
+    assert "nothing converts it" in found[0].what
+
+
 RADIATION = (
     "  radiation: {from: one, rate: 2e-10 * ((one + 273.15)**4 - (air + 273.15)**4), unit: W}\noutputs:"
 )

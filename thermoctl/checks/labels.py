@@ -9,7 +9,7 @@ ranges:
 n is the number of independent residuals of the corrected recordings: samples over their integrated
 autocorrelation time (Geyer 1992, initial positive sequence). The gain is the logarithm of a likelihood ratio.
 It has to exceed log(RARITY) plus the logarithm of the number of hypotheses. The correction also has to
-halve the misfit of its columns.
+halve the misfit of its columns. A mistake that the plant file shows, too, needs log(SHOWN) alone.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from thermoctl.recording.table import Table
 from thermoctl.units import conversion, dimension
 
 RARITY = 1000.0  # prior odds against a wrong label
+SHOWN = 20.0  # odds that recordings must give a mistake that the plant file shows, too
 CLOSE = 2.0  # residual over noise below which no wrong label is sought
 FOLLOWS = 0.5  # a corrected column has to be followed to within this share of its spread
 HALVED = 0.5  # share of the misfit of its columns that a correction may leave at most
@@ -52,7 +53,9 @@ Change = Callable[[Table], Table]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A wrong label: a sentence about it, its correction in words, and the corrected table or plant."""
+    """A wrong label: a sentence about it, its correction in words, and the corrected table or plant.
+
+    `shown`: the plant file shows it, too."""
 
     kind: str
     what: str
@@ -60,6 +63,7 @@ class Hypothesis:
     change: Change = lambda table: table
     columns: tuple[str, ...] = ()
     plant: Plant | None = None
+    shown: bool = False
 
 
 def label_findings(model: Model, tables: Sequence[Table]) -> tuple[list[Finding], list[Table]]:
@@ -93,7 +97,7 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
     hypotheses = [*_clocks(model, tables), *_hypotheses(model.plant, tables), *_turned(model.plant)]
     for f, right in unconverted(model.plant):
         todo = f"{f.suggestion.removesuffix('.')}: {f.where}."
-        hypotheses.append(Hypothesis(f.kind, f.what, todo, plant=right))
+        hypotheses.append(Hypothesis(f.kind, f.what, todo, plant=right, shown=True))
     proof = log(RARITY * max(len(hypotheses), 1))
     screened: list[tuple[float, Hypothesis]] = []
     plain = _screened(model, tables)
@@ -101,7 +105,7 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
         tried = _screened(_model(model, h), [h.change(t) for t in tables])
         screened.append((float(np.sum(now.independent * np.log(plain / tried))), h))
     screened.sort(key=lambda pair: -pair[0])
-    best: tuple[float, Hypothesis] | None = None
+    best: tuple[bool, float, Hypothesis] | None = None
     for _, h in screened[:REFITTED]:
         then = _misfit(_model(model, h), [h.change(t) for t in tables], refit=True)
         if then is None:
@@ -111,9 +115,10 @@ def _best(model: Model, tables: Sequence[Table]) -> Hypothesis | None:
         part = changed or list(range(len(then.share)))
         followed = np.sqrt(np.mean(then.share[part] ** 2))
         left = followed / np.sqrt(np.mean(now.share[part] ** 2))
-        if gain > proof and followed < FOLLOWS and left < HALVED and (best is None or gain > best[0]):
-            best = gain, h
-    return best[1] if best else None
+        proven = gain > log(SHOWN) if h.shown else gain > proof and followed < FOLLOWS and left < HALVED
+        if proven and (best is None or (h.shown, gain) > best[:2]):
+            best = h.shown, gain, h
+    return best[-1] if best else None
 
 
 @dataclass(frozen=True)
