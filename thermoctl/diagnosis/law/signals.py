@@ -156,8 +156,7 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     for n in near:
         out += [_between(rig, place, n, i) for i in _beside(rig, n)]
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
-    if place.source and p.nodes[place.source].unit == p.nodes[place.target].unit:
-        out.append(_between(rig, place, place.source, place.target))
+    out += _across(rig, place)
     far = _far(p, place)
     for n in (n for n in p.nodes if n not in near and n not in far):
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
@@ -232,6 +231,20 @@ def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
     own = n in place.nodes and n in rig.velocities and not place.source and place.part == "flow"
     is_position = n in rig.pairs.values()
     return Signal(n, name(n), unit, position=is_position, drives=own, recorded=n in rig.physics.inputs)
+
+
+def _across(rig: Rig, place: Place) -> list[Signal]:
+    """Return the differences between the two ends of a flow: of nodes, of their positions, of what they radiate."""
+    nodes, out = rig.physics.nodes, list[Signal]()
+    ends = [place.source or "", place.target]
+    for a, b in (ends, [rig.pairs.get(n, "") for n in ends]):
+        if a and b and nodes[a].unit == nodes[b].unit:
+            out.append(_between(rig, place, a, b))
+            if (unit := nodes[a].unit) in TEMPERATURE:
+                fourth = [ex.power(ex.add(name(n), num(273.15 - zero_of(unit))), num(4.0)) for n in (a, b)]
+                radiated = ex.add(fourth[0], ex.neg(fourth[1]))
+                out.append(Signal(f"{a}^4 - {b}^4", radiated, "K**4", drives=place.part == "flow"))
+    return out
 
 
 def _between(rig: Rig, place: Place, a: str, b: str) -> Signal:

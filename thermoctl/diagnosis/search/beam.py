@@ -430,14 +430,15 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
         added, gain = item
-        keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
+        known = parent.fitted.hypothesis.keys
+        keys = known | {d.candidate.key for d in added}
         if keys in tried or keys in s.refitted or len(keys) > limits.effects:
             return False
         ahead = max([*tried.values(), *out], key=lambda w: w.score)
         own = ahead.fitted.hypothesis.keys
         if own not in quiet:
             quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        rival = _rival(added, own - parent.fitted.hypothesis.keys)
+        rival = _rival(added, [e for e in ahead.fitted.hypothesis.effects if e.key not in known])
         if parent.score + _reach(gain, ratio, quiet[own] and not rival) < ahead.score:
             return False
         case.budget.untried += case.budget.spent
@@ -464,11 +465,12 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     return out
 
 
-def _rival(added: Sequence[Direction], leading: Keys) -> bool:
-    """Return whether an effect to add acts at the place of an effect of the leader.
+def _rival(added: Sequence[Direction], leading: Sequence[Placed]) -> bool:
+    """Return whether an effect to add acts at the place, or at a node, of an effect that leads.
 
-    A promise tells little between two effects at one place, as between a lag and a delay of a reading."""
-    return bool({d.candidate.key[1] for d in added} & {where for _, where in leading})
+    A promise tells little between two effects there, as between a lag and a delay of a reading."""
+    at = [{c.key[1], *c.place.parts()} for c in (d.candidate for d in added)]
+    return any(own & {e.key[1], *e.candidate.place.parts()} for own in at for e in leading)
 
 
 def _reach(gain: float, ratio: float, quiet: bool) -> float:
