@@ -47,7 +47,8 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
-    for parent in (alone,) if best is alone else (alone, best):
+    parents = {w.fitted.hypothesis.keys: w for w in (alone, best, *_beside_bounded(s, best))}
+    for parent in parents.values():
         if case.budget.stopped() or len(parent.fitted.hypothesis.effects) >= limits.effects:
             continue
         if parent is not alone and only_noise(case, parent.fitted, limits):
@@ -65,6 +66,15 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
     return searched(s)
+
+
+def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:
+    """Return a hypothesis without each of its effects that ended at a bound: there it is other physics.
+
+    A creep that takes far longer than the recording is a spring."""
+    keys, bounds = best.fitted.hypothesis.keys, best.fitted.fit.at_bound.keys()
+    bounded = [e.key for e in best.fitted.hypothesis.effects if bounds & {*e.own.values()}]
+    return [s.tried[keys - {key}] for key in bounded if keys - {key} in s.tried]
 
 
 def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:

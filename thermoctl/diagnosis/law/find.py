@@ -18,6 +18,8 @@ from thermoctl.diagnosis.law.refit import (
     affordable,
     at_bound,
     law_rate,
+    laws_of,
+    limit_of,
     refitted_law,
     simpler_law,
 )
@@ -132,7 +134,8 @@ def refits(
 ) -> list[tuple[Proposal, Fitted]]:
     """Refit the proposals that may beat the best law so far.
 
-    From the best sum, and from one with an insignificant term, the least significant term is left out.
+    From the best sum, and from one with an insignificant term, the least significant term is left out. A term
+    whose shape is at its upper bound gets the form that it becomes there.
     All promises are multiplied by the largest ratio so far of a refit's gain to its promise. Beside a best
     hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
     tried = list[tuple[Proposal, Fitted]]()
@@ -164,8 +167,8 @@ def refits(
                 tried.append((p, f))
             best = more_evidence - p.cost >= ahead
             ahead = max(ahead, more_evidence - p.cost)
-            if len(p.terms) > 1 and more and (f.doubtful or at_bound(f) or best):
-                simpler = simpler_law(p, f)
+            if more and (at_bound(f) or len(p.terms) > 1 and (f.doubtful or best)):
+                simpler = simpler_law(p, f) if len(p.terms) > 1 else limit_of(laws_of(f)[0], f)
                 if simpler.kind not in {q.kind for q in queue}:
                     queue.append(simpler)
                     more -= 1

@@ -59,7 +59,7 @@ class Form:
     sizes: tuple[str, ...] = ("A",)
     memory: str | None = None
     odd: bool = False  # does the term change its sign with its signal?
-    limit: str | None = None  # the form that it becomes at the upper bound of s, with the size A / s
+    limit: str | None = None  # the form that it becomes at the upper bound of a shape
     twin: str | None = None  # the form that it equals where its signal is nowhere negative
 
 

@@ -14,7 +14,7 @@ from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.law.forms import law_effect, library, of_plant, readable
+from thermoctl.diagnosis.law.forms import Form, Term, combined, law_effect, library, of_plant, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.files.yamlfile import InputError
@@ -106,15 +106,32 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
 
 
 def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
-    """Return a refitted law of one term, with the form that it becomes where its shape s is at its bound."""
+    """Return a refitted law of one term; of the form that it becomes, where a shape is at its upper bound."""
     p, (term,) = law.proposal, law.proposal.terms
     values = {q: f.plant.parameters[name].value for q, name in law.own.items()}
     sizes = tuple(values[f"{q}1"] for q in term.form.sizes)
-    shapes = {q: values[f"{q}1"] for q in term.form.shapes}
-    if term.form.limit and f.fit.at_bound.get(law.own["s1"]) == "high":
-        form = next(x for x in library() if x.name == term.form.limit)
-        term, sizes, shapes = dataclasses.replace(term, form=form), (sizes[0] / shapes["s"],), {}
-    return dataclasses.replace(p, terms=(dataclasses.replace(term, shapes=shapes),), sizes=sizes)
+    term = dataclasses.replace(term, shapes={q: values[f"{q}1"] for q in term.form.shapes})
+    high = any(f.fit.at_bound.get(law.own[f"{q}1"]) == "high" for q in term.form.shapes)
+    if term.form.limit and high:
+        term, sizes = _likest(term, sizes, next(x for x in library() if x.name == term.form.limit))
+    return dataclasses.replace(p, terms=(term,), sizes=sizes)
+
+
+def _likest(term: Term, sizes: Sequence[float], form: Form) -> tuple[Term, tuple[float]]:
+    """Return the term of another form, with one size, that is nearest at the values that its signal visits."""
+    signal = term.signals[0]
+    at = {"z": np.array(signal.visited), "w": 1.0}
+    own = {**term.shapes, **dict(zip(term.form.sizes, sizes, strict=True))}
+    truth = np.asarray(ex.evaluate(term.form.text, {**at, **own}))
+    grid = combined({q: s.scaled(s.values, signal, term.duration) for q, s in form.shapes.items()})
+    tried = []
+    for values in zip(*grid.values(), strict=True) if grid else [()]:
+        shapes = dict(zip(grid, map(float, values), strict=True))
+        unit = np.asarray(ex.evaluate(form.text, {**at, **shapes, "A": 1.0}))
+        size = float(unit @ truth / (unit @ unit))
+        tried.append((float(np.sum((size * unit - truth) ** 2)), size, shapes))
+    _, size, shapes = min(tried, key=lambda x: x[0])
+    return dataclasses.replace(term, form=form, shapes=shapes), (size,)
 
 
 def simpler_law(p: Proposal, f: Fitted) -> Proposal:

@@ -17,6 +17,7 @@ from thermoctl.units import conversion, dimension
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
 FOLLOWS = 0.9  # share of a column's variance that a node or an output shows, above which it may be a reading
 ALIKE = 1 - 1e-6  # correlation about zero from which two signals are one
+HOME = 0.1  # share of a position's range up to which its zero is near
 DRAWS = 5  # number of values of all names for which two rates are compared
 QUANTILES = 21  # number of quantiles of a signal, 5 % apart
 
@@ -270,7 +271,9 @@ def _values(e: Expr, runs: Sequence[Values]) -> np.ndarray:
 
 def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
     values = _values(s.value, runs)
-    centre = float(np.mean(values)) if s.kelvin is not None or s.position else 0.0
+    reach = HOME * float(np.ptp(values))  # a position counts from its zero where it comes near it
+    away = s.position and not values.min() - reach < 0 < values.max() + reach
+    centre = float(np.mean(values)) if s.kelvin is not None or away else 0.0
     size = float(np.sqrt(np.mean((values - centre) ** 2)))
     if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):
         return None
