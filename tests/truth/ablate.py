@@ -181,16 +181,6 @@ RULES: Mapping[str, Rule] = {
         {"law.contest._leading": lambda s, size: s.best},
         searches=True,
     ),
-    "near": Rule(
-        "4.6 nats below a best that leaves only noise nothing is refitted or extended",
-        {"search.beam.NEAR": float("inf")},
-        searches=True,
-    ),
-    "rivals": Rule(
-        "beside such a best, rivals at its effects' places are refitted by twice their promise",
-        {"search.beam._rival": _no},
-        searches=True,
-    ),
     "far": Rule(
         "a law depends on no node that acts only through two others",
         {"law.signals._far": _nothing},

@@ -10,7 +10,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.law.free import PIECES, pieces
+from thermoctl.diagnosis.law.free import PIECES, SPREAD, pieces
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import (
     SIMPLER,
@@ -25,7 +25,6 @@ from thermoctl.diagnosis.law.refit import (
 )
 from thermoctl.diagnosis.law.signals import Signal
 from thermoctl.diagnosis.law.smooth import Tracked, law_unit, tracked
-from thermoctl.diagnosis.search.beam import SPREAD
 from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import batches, each

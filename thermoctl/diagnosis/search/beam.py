@@ -25,7 +25,6 @@ from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, fou
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
-from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
 from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
@@ -41,11 +40,6 @@ from thermoctl.plant.simulation.simulate import Excitation, SimulationError, com
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
 SURPLUS = 5.0  # nats by which an effect of no size must lead, so that the others are refitted without it
-# If the residual of the best is only noise, a hypothesis so many nats below is not refitted nor extended.
-# It has a hundredth of the probability.
-NEAR = 4.6
-# Largest ratio of a gain to its prediction beside noise, over those before: 45 refits of 14 cases.
-SPREAD = 1.15
 # Nats below the best, from which a law is left out; for each effect allowed, also an earlier hypothesis.
 BEATEN = 10.0
 # Share of the hypotheses near the best that will be extended, for the time left that the progress states.
@@ -190,9 +184,7 @@ def grow(s: Search) -> None:
         first, *others = leaders(list(s.tried.values()), s.limits)
         # one effect more may make such a hypothesis the better one
         fewer = [w for w in others if _number(w) < _number(first)]
-        if close := only_noise(s.case, first.fitted, s.limits):
-            near = first.score - NEAR
-            others = [w for w in others if w.score >= near or _number(w) < _number(first)]
+        close = only_noise(s.case, first.fitted, s.limits)
         rounds = s.limits.effects - number - 1
         # beside the plant alone none is known
         follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
@@ -416,11 +408,10 @@ def leaders(tried: Sequence[Weighed], limits: Thresholds) -> list[Weighed]:
 def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
-    An extension is left out if the largest gain that is reckoned with (`_reach`) does not bring it to the
-    leader. Every prediction is multiplied by the largest ratio so far of a refit's gain to its prediction."""
+    An extension is left out if twice its predicted gain does not bring it to the leader. Every prediction is
+    multiplied by the largest ratio so far of a refit's gain to its prediction."""
     case, where, limits, tried = s.case, s.where, s.limits, s.tried
     out: list[Weighed] = []
-    quiet: dict[Keys, bool] = {}  # is the residual of a leader only noise?
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
     queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
@@ -430,16 +421,10 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     def wanted(item: Extension) -> bool:
         """Return whether an extension is new and may win, and a refit is left."""
         added, gain = item
-        known = parent.fitted.hypothesis.keys
-        keys = known | {d.candidate.key for d in added}
+        keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in tried or keys in s.refitted or len(keys) > limits.effects:
             return False
-        ahead = max([*tried.values(), *out], key=lambda w: w.score)
-        own = ahead.fitted.hypothesis.keys
-        if own not in quiet:
-            quiet[own] = parent is not ahead and only_noise(case, ahead.fitted, limits)
-        rival = _rival(added, [e for e in ahead.fitted.hypothesis.effects if e.key not in known])
-        if parent.score + _reach(gain, ratio, quiet[own] and not rival) < ahead.score:
+        if parent.score + HALF * ratio * gain < max(w.score for w in [*tried.values(), *out]):
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
@@ -465,23 +450,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     return out
 
 
-def _rival(added: Sequence[Direction], leading: Sequence[Placed]) -> bool:
-    """Return whether an effect to add acts at the place, or at a node, of an effect that leads.
-
-    A promise tells little between two effects there, as between a lag and a delay of a reading."""
-    at = [{c.key[1], *c.place.parts()} for c in (d.candidate for d in added)]
-    return any(own & {e.key[1], *e.candidate.place.parts()} for own in at for e in leading)
-
-
-def _reach(gain: float, ratio: float, quiet: bool) -> float:
-    """Return the largest gain that is reckoned with: twice the prediction, beside noise less.
-
-    `quiet`: is the leader's residual only noise? Then an extension of unknown gain is left out."""
-    if not quiet:
-        return HALF * ratio * gain
-    return SPREAD * ratio * gain + NEAR if np.isfinite(gain) else -np.inf
-
-
 def _expected(
     case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Thresholds, untried: float
 ) -> float:
@@ -493,5 +461,4 @@ def _expected(
         return CLOSE * limits.beam * untried
     if not only_noise(case, leader, limits):
         return np.inf
-    scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
-    return CLOSE * sum(score >= scores[0] - NEAR for score in scores)
+    return CLOSE * min(len(tried), limits.beam)
