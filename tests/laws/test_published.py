@@ -159,3 +159,86 @@ def test_chambers_that_no_flow_links_leak_into_each_other():
     assert found.law is not None and found.law.proposal.place.where == "a-b"
     q = {k: found.law.fitted.plant.parameters[f"{k}1_law_a_b"].value for k in "AZ"}
     assert q["A"] / q["Z"] == pytest.approx(1.2e-12, rel=0.02)
+
+
+FURNACE = """
+format: thermoctl-plant/1
+title: An element that heats a load; what it radiates is not in the model
+inputs:
+  heater: {unit: W}
+  air: {unit: degC, role: ambient}
+parameters:
+  C_element: {value: 150, unit: J/K, range: [50, 400]}
+  C_load: {value: 1100, unit: J/K, range: [400, 3000]}
+  G: {value: 0.8, unit: W/K, range: [0.1, 4]}
+  G_air: {value: 2.0, unit: W/K, range: [0.5, 8]}
+nodes:
+  element: {unit: degC, storage: C_element, initial: air}
+  load: {unit: degC, storage: C_load, initial: air}
+flows:
+  heating: {into: element, rate: heater, unit: W}
+  joint: {from: element, into: load, rate: G * (element - load), unit: W}
+  loss: {from: load, rate: G_air * (load - air), unit: W}
+outputs:
+  TC1: {value: element, unit: degC, noise: 1.0}
+  TC2: {value: load, unit: degC, noise: 0.5}
+"""
+CLAMP = """
+format: thermoctl-plant/1
+title: A two-stage filter with a diode at its output that is not in the model
+inputs:
+  source: {unit: V}
+parameters:
+  R1: {value: 1000, unit: ohm}
+  R2: {value: 2200, unit: ohm, range: [1500, 3300]}
+  C1: {value: 1.1e-6, unit: F, range: [5e-7, 2e-6]}
+  C2: {value: 5.0e-7, unit: F, range: [2e-7, 1e-6]}
+nodes:
+  v1: {unit: V, storage: C1, initial: 0}
+  v2: {unit: V, storage: C2, initial: 0}
+flows:
+  i1: {into: v1, rate: (source - v1) / R1, unit: A}
+  i2: {from: v1, into: v2, rate: (v1 - v2) / R2, unit: A}
+outputs:
+  ch1: {value: v1, unit: V, noise: 0.003}
+  ch2: {value: v2, unit: V, noise: 0.003}
+"""
+
+
+def with_flow(text, flow):
+    """Return a plant with one flow more."""
+    return loads(text.replace("flows:", f"flows:\n  true: {{{flow}}}"))
+
+
+def test_bodies_radiate_to_each_other():
+    """It was a law of eight sizes, 1180 in chi-square off: only the difference of temperatures was a signal."""
+    true = with_flow(
+        FURNACE,
+        'from: element, into: load, rate: "1.3e-9 * ((element + 273.15)**4 - (load + 273.15)**4)", unit: W',
+    )
+    t, rng = np.arange(0.0, 5400.0, 9.0), np.random.default_rng(5)
+    inputs = {"heater": np.repeat(rng.uniform(50, 900, 20), 30), "air": 21 + 0.3 * np.sin(t / 900)}
+    table = compile_plant(true).measure(Table("r", "r.csv", t, inputs), 2)
+    found = diagnose(loads(FURNACE), [table], catalogue(), limits())
+    assert found.decision.named == (("law", "element-load"),)
+    assert [s.label for p in found.law.proposal.terms for s in p.signals] == ["element^4 - load^4"]
+    q = {k: found.law.fitted.plant.parameters[f"{k}1_law_element_load"] for k in "AZ"}
+    assert q["A"].value / q["Z"].value == pytest.approx(1.3e-9, rel=0.02) and q["Z"].unit == "K**4"
+
+
+def test_a_step_that_ends_at_its_bound_is_tried_as_an_exponential():
+    """A diode was a law of three terms: the logistic step that leads ended at its bound, and nothing followed."""
+    text = CLAMP.replace("storage: C2", 'storage: "C2 * (1 - 0.01 * v2)"')  # a misfit that nobody names
+    true = with_flow(text, 'from: v2, rate: "2.2e-8 * (exp(v2 / 0.052) - 1)", unit: A')
+    t, rng = np.arange(0.0, 0.3, 2e-4), np.random.default_rng(6)
+    chirp = 0.9 * np.sin(2 * np.pi * (4 * t + 193 * t**2)) - 0.1
+    steps = np.repeat(rng.uniform(-1.2, 0.95, 100), 15)
+    tables = [
+        compile_plant(true).measure(Table(f"r{k}", f"r{k}.csv", t, {"source": u}), k)
+        for k, u in enumerate((chirp, steps))
+    ]
+    found = diagnose(loads(CLAMP), tables, catalogue(), limits())
+    assert found.decision.named == (("law", "v2"),)
+    assert [p.form.name for p in found.law.proposal.terms] == ["exponential"]
+    q = {k: found.law.fitted.plant.parameters[f"{k}1_law_v2"].value for k in ("A", "s", "Z")}
+    assert q["s"] * q["Z"] == pytest.approx(0.052, rel=0.02)
