@@ -127,10 +127,13 @@ def _near_null(f: Fitted, e: Placed, p: EffectParameter) -> bool:
 
 
 def _one_does_not_stand(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
-    """Return whether an amplitude is within SIGNIFICANT sd of no effect; those of one direction are one."""
+    """Return whether an amplitude is within SIGNIFICANT sd of no effect; those of one direction are one.
+
+    The first one is that of the simpler entry which the effect contains. The plant may have it already."""
     if len(e.candidate.effect.dims) == 1:
         return _none_stands(f, e, sizes)
-    return any(_near_null(f, e, p) for p in sizes)
+    own = sizes[1:] if e.candidate.effect.contains and len(sizes) > 1 else sizes
+    return any(_near_null(f, e, p) for p in own)
 
 
 def _none_stands(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> bool:
