@@ -118,7 +118,7 @@ def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
 
 
 def _likest(term: Term, sizes: Sequence[float], form: Form) -> tuple[Term, tuple[float]]:
-    """Return the term of another form, with one size, that is nearest at the values that its signal visits."""
+    """Return the term of another form, with one size, that is nearest where its signal goes."""
     signal = term.signals[0]
     at = {"z": np.array(signal.visited), "w": 1.0}
     own = {**term.shapes, **dict(zip(term.form.sizes, sizes, strict=True))}
