@@ -38,7 +38,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
     linear = Tracked(metric, metric.residual, {})
     rig = case.rig(f.rough_plant, metric.drives)
-    where = places(rig)
+    where = places_in(case, rig)
     combos = choices(rig, where, entered(case, f, where, NODES), linear)
     moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
     both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
@@ -47,6 +47,11 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     gains = [gain + off for gain, *_ in ranked(linear, combos)[:1]]
     gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
     return SPREAD * max(gains, default=-np.inf) > look + unlikely(limits)
+
+
+def places_in(case: Case, rig: Rig) -> list[Place]:
+    """Return the places of laws at nodes of the plant file. What an effect added is its own, such as a lag."""
+    return [p for p in places(rig) if {*p.nodes} <= case.plant.nodes.keys()]
 
 
 def entered(case: Case, f: Fitted, where: Sequence[Place], most: int) -> list[str]:

@@ -27,11 +27,12 @@ from thermoctl.diagnosis.law.free import (
     energy,
     entered,
     log_number,
+    places_in,
     predicted,
     ranked,
     unlikely,
 )
-from thermoctl.diagnosis.law.signals import Place, Signal, places, rates, signals
+from thermoctl.diagnosis.law.signals import Place, Signal, rates, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import chunks
@@ -231,7 +232,7 @@ def linearised(case: Case, parent: Fitted) -> tuple[Rig, list[Place], Tracked]:
     Raises SimulationError."""
     drives = case.drives(parent.rough.model)
     rig = case.rig(parent.rough_plant, drives)
-    where = places(rig)
+    where = places_in(case, rig)
     return rig, where, tracked(case, parent, entered(case, parent, where, TRACKED))
 
 
