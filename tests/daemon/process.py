@@ -60,7 +60,7 @@ class Daemon:
                 [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(config)],
                 stdout=log,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/hal", "OPENBLAS_NUM_THREADS": "1"},
             )
         try:
             wait(lambda: self.process.poll() is not None or self.ask("status")["state"] == "READY", "READY")

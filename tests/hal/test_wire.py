@@ -271,6 +271,19 @@ def test_a_board_survives_a_writer_killed_while_writing(wired):
     assert board.merge(shown, device.roles, seen) > seen and shown.value[COIL] == 22.5
 
 
+def test_a_command_that_is_being_written_is_the_one_before(wired):
+    """Read as disabled, it would switch an armed amplifier off for a turn."""
+    device = next(d for d in make_devices(wired) if d.drives)
+    board = Board.private()
+    assert board.command(device) == (0.0, False, -math.inf)
+    board.send(device, 0.5, True, 1.0)
+    assert board.command(device) == (0.5, True, 1.0)
+    board.rows["command_sequence"][device.roles[0]] += 1  # the loop is amid a write
+    assert board.command(device) == (0.5, True, 1.0)
+    board.send(device, 0.0, False, 2.0)
+    assert board.command(device) == (0.0, False, 2.0)
+
+
 def test_control_socket_answers_nonsense_plainly(wire):
     path = wire.rig.run_dir / "control.sock"
     assert "did you mean 'encoder'" in tell(path, "encodr unplug")

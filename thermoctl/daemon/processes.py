@@ -214,10 +214,15 @@ class Child:
         """Whether the process runs."""
         return self.process is not None and self.process.is_alive()
 
+    def ask(self) -> None:
+        """Ask it to stop."""
+        if self.alive:
+            self.process.terminate()
+
     def end(self, limit_s: float = STOP_S) -> None:
         """Ask it to stop; kill it when it does not."""
         if self.alive:
-            self.process.terminate()
+            self.ask()
             self.process.join(limit_s)
             if self.process.is_alive():
                 self.process.kill()

@@ -243,6 +243,8 @@ class _Supervision:
         self._look()
         self._keep()
         for child in (*self.others, self.reloading):
+            child.ask()
+        for child in (*self.others, self.reloading):
             child.end()
 
 

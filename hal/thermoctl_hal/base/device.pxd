@@ -2,7 +2,7 @@
 from thermoctl_hal.base.wire cimport Channels
 
 cdef class Device:
-    cdef public object binding, name, counts
+    cdef public object binding, name, counts, is_urgent
     cdef public dict problems
     cdef public list roles
     cdef public bint slow, drives, up

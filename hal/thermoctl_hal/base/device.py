@@ -11,12 +11,18 @@ exception: without its link its state is unknown, so its channels are ERROR at o
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from thermoctl.rig.channels import AxesChannels
 from thermoctl_hal.base.backend import ERROR, STALE, Sample
 from thermoctl_hal.base.binding import NO_VALUE, Binding
 from thermoctl_hal.base.wire import Channels
+
+
+def _never() -> bool:
+    return False
 
 
 class Device:
@@ -39,6 +45,8 @@ class Device:
         parts = binding.channels.parts if isinstance(binding.channels, AxesChannels) else {}
         self.axis = list(parts).index(binding.axis) if binding.axis else 0
         """Number of the axis that it drives."""
+        self.is_urgent: Callable[[], bool] = _never
+        """Says whether another device of the port must be served now, so that a reading is broken off."""
 
     def connect(self) -> None:
         """Open and configure the device; may block.

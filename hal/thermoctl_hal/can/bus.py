@@ -28,7 +28,7 @@ import os
 import re
 import struct
 import threading
-from collections import deque
+from collections import defaultdict, deque
 from typing import Any
 
 from thermoctl_hal.base.backend import HardwareError
@@ -417,7 +417,7 @@ class SharedPort(CanPort):
 
     def close(self) -> None:
         """End the use of the adapter; its last user closes it."""
-        with _LOCK:
+        with _LOCKS[self.hub.port]:
             if self in self.hub.ports:
                 self.hub.ports.remove(self)
             if not self.hub.ports:
@@ -427,7 +427,7 @@ class SharedPort(CanPort):
 
 
 _HUBS: dict[str, Hub] = {}
-_LOCK = threading.Lock()
+_LOCKS: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)  # a dead port delays no other one
 AnyPort = SlcanPort | LibraryPort | SharedPort
 _PORT = re.compile(r"(\w+):(.+?)(?:@(\d+)(?:,(\d+))?)?")
 
@@ -438,7 +438,7 @@ def open_can(port: str, ids: tuple[int, ...], shared: bool = False) -> AnyPort:
     shared: other devices of this process use the adapter, too. Raises HardwareError."""
     if not shared:
         return _open(port, ids)
-    with _LOCK:
+    with _LOCKS[port]:
         hub = _HUBS.get(port)
         if hub is None or hub.broken:
             hub = _HUBS[port] = Hub(port, _open(port, ()))

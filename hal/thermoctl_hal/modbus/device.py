@@ -243,6 +243,7 @@ class ModbusDevice(Device):
         code = 0
         for _ in range(BUSY_TRIES):
             try:
+                self._link.is_urgent = self.is_urgent
                 answer = self._link.read(
                     block.kind, block.address, block.count, self.binding.address, self._spec.timeout_s
                 )

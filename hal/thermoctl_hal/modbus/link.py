@@ -25,6 +25,8 @@ import select
 import struct
 import threading
 import time
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +51,7 @@ HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the lo
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
 """Pause between connecting and the first request: one step more after each connection that gave no answer."""
 GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
+LOOK_S = 0.005  # time between two looks whether another device has to be served
 CHUNK = 4096
 ATTEMPTS = 3  # largest number of times that a request is sent, if the server closes the connection
 _HOST = r"(\[[^]]+\]|[^:/]+):(\d+)/?"
@@ -102,11 +105,14 @@ class _Echo:
 
 
 class Link:
-    """An open port. `users` counts its devices; `broken`: to be opened again."""
+    """An open port. `users` counts its devices; `broken`: to be opened again.
+
+    `is_urgent` says that another device of the port must be served now: a reading is broken off then."""
 
     def __init__(self, port: str, line: LineSettings, timeout_s: float) -> None:
         self.port, self.line, self.users, self.broken = port, line, 0, False
         self._lock = threading.Lock()
+        self.is_urgent: Callable[[], bool] = lambda: False
         self._transaction = 0
         self._echoes = False  # does the line send our own bytes back?
         self._answered = False
@@ -223,9 +229,7 @@ class Link:
         end = time.monotonic() + timeout_s
         self._send(request.frame, end)
         received = b""
-        while (left := end - time.monotonic()) > 0.0:
-            if not select.select([self._line], [], [], left)[0]:
-                break
+        while self._arrives(request, end):
             received += self._take()
             answer = self._found_rtu(received, request) if self._is_rtu else _found_tcp(received, request)
             if answer is not None:
@@ -235,6 +239,14 @@ class Link:
         if self._is_rtu and request.function in FUNCTIONS.values():
             self._lost.add(key)
         raise NoAnswer(self._why(received, request, timeout_s))
+
+    def _arrives(self, request: _Request, end_s: float) -> bool:
+        """Wait for bytes until `end_s`; a reading waits no longer when it `is_urgent`."""
+        is_reading = request.function in FUNCTIONS.values()
+        while (left := end_s - time.monotonic()) > 0.0 and not (is_reading and self.is_urgent()):
+            if select.select([self._line], [], [], min(left, LOOK_S))[0]:
+                return True
+        return False
 
     def _rest(self) -> None:
         """Keep the silence that must follow an RTU frame."""
@@ -263,9 +275,8 @@ class Link:
         echo.waits += 1
         if self._found_rtu(echo.received, request) is None:  # else it is at work, and slow
             self._send(echo.next_frame(request.transaction), end)
-        while unit in self._late and (left := end - time.monotonic()) > 0.0:
-            if select.select([self._line], [], [], left)[0]:
-                self._take()
+        while unit in self._late and self._arrives(request, end):
+            self._take()
         self._rest()
         if unit not in self._late:
             return
@@ -424,12 +435,12 @@ def _wrong_tcp(data: bytes, request: _Request) -> str:
 
 _LINKS: dict[str, Link] = {}
 _SILENT: dict[str, int] = {}  # network port -> connections in a row that gave no answer
-_LOCK = threading.Lock()
+_LOCKS: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)  # a dead port delays no other one
 
 
 def join(port: str, line: LineSettings, timeout_s: float) -> Link:
     """Return the link of this port, opened by its first user. Raises HardwareError."""
-    with _LOCK:
+    with _LOCKS[port]:
         link = _LINKS.get(port)
         if link is None or link.broken:
             link = _LINKS[port] = Link(port, line, timeout_s)
@@ -439,7 +450,7 @@ def join(port: str, line: LineSettings, timeout_s: float) -> Link:
 
 def leave(link: Link) -> None:
     """End the use of a link; its last user closes it."""
-    with _LOCK:
+    with _LOCKS[link.port]:
         link.users -= 1
         if link.users <= 0:
             link.close()

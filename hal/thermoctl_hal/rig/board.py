@@ -45,6 +45,7 @@ class Board:
         self._path, self._owner, self._buffer = path, owner, buffer
         self.rows: Any = np.ndarray(len(buffer) // _ROW.itemsize, _ROW, buffer)
         self._sequence = self.rows["sequence"]
+        self._commands: dict[Device, tuple[float, bool, float]] = {}  # the last that was read whole
         if owner:
             self.rows["sequence"] = self.rows["command_sequence"] = 0
             self.rows["value"], self.rows["time_s"], self.rows["status"] = np.nan, -np.inf, ABSENT
@@ -130,13 +131,13 @@ class Board:
     def command(self, device: Device) -> tuple[float, bool, float]:
         """Return the last command of a slow amplifier, whether it is enabled, and when it was sent (s).
 
-        Disabled, from -inf, while the loop writes and before its first command."""
+        While the loop writes it is the one before; before the first it is disabled, from -inf."""
         row = self.rows[device.roles[0]]
         before = int(row["command_sequence"])
         command = float(row["command"]), bool(row["command_enable"]), float(row["command_s"])
-        if before == 0 or before & 1 or int(row["command_sequence"]) != before:
-            return 0.0, False, -math.inf
-        return command
+        if before and not before & 1 and int(row["command_sequence"]) == before:
+            self._commands[device] = command
+        return self._commands.get(device, (0.0, False, -math.inf))
 
     def beat(self, roles: list[int]) -> int:
         """Return the number of posts of the device with these roles, to detect a hung poller."""

@@ -165,19 +165,25 @@ class DevicesBackend:
     def close(self) -> None:
         """Disable and release everything; see thermoctl_hal.base.backend."""
         self._stop.set()
+        self._switch_off()  # before the wait for a device that is being connected
         for repair in list(self._repairs.values()):
             repair.join(5.0)
+        self._switch_off()
         for device in self.fast:
             if device.up:
-                if device.drives:
-                    with contextlib.suppress(OSError, HardwareError):
-                        device.write(0.0, False, time.monotonic())
                 device.up = False
                 device.disconnect()
         for thread in self._threads:
             thread.join(5.0)
         if self._threads:
             self._threads, self.board = [], None
+
+    def _switch_off(self) -> None:
+        """Disable every amplifier that is connected."""
+        for device in self.fast:
+            if device.drives and device.up:
+                with contextlib.suppress(OSError, HardwareError):
+                    device.write(0.0, False, time.monotonic())
 
     def problem(self, role: str) -> str:
         """Return in one line why `role` is not OK; '' when it is."""

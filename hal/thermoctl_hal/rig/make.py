@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
@@ -15,6 +16,7 @@ from thermoctl_hal.profiles.buses import BUSES, part
 from thermoctl_hal.rig.axes import AxisBackend
 from thermoctl_hal.rig.board import Board
 from thermoctl_hal.rig.devices import DevicesBackend
+from thermoctl_hal.rig.poller import ports
 from thermoctl_hal.simulated.faulty import FaultInjector, schedule
 
 SIMULATED = "thermoctl_hal.simulated.rig:simulated_backend"
@@ -91,14 +93,22 @@ def disable_amplifier(settings: Settings) -> None:
     OSError, InputError."""
     if settings.hal.backend != "devices":
         return
+    groups = ports(driving_devices(settings))
+    with ThreadPoolExecutor(len(groups) or 1) as pool:  # a dead port delays no other one
+        failed = [line for lines in pool.map(_switch_off, groups) for line in lines]
+    if failed:
+        raise HardwareError("; ".join(failed))
+
+
+def _switch_off(devices: list[Device]) -> list[str]:
+    """Disable the amplifiers of a port in turn; return a line for each that failed."""
     failed = []
-    for device in driving_devices(settings):
+    for device in devices:
         try:
             device.switch_off()
         except (HardwareError, OSError) as e:  # the other axes' amplifiers are switched off all the same
             failed.append(f"{device.name}: {e}")
-    if failed:
-        raise HardwareError("; ".join(failed))
+    return failed
 
 
 def make_devices(settings: Settings) -> list[Device]:

@@ -7,7 +7,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 from thermoctl_hal.base.backend import STALE, HardwareError, Sample
 from thermoctl_hal.base.binding import port_key
@@ -30,18 +31,37 @@ def ports(devices: Iterable[Device]) -> list[list[Device]]:
 def poll_until(devices: list[Device], board: Board, stop: threading.Event) -> None:
     """Poll the slow devices of a port and post to the board, until `stop` is set.
 
-    Each is polled at its fastest channel's rate; the longest overdue comes next. A device that is gone is
-    connected again, and its last values are kept until they are stale."""
+    Each is polled at its fastest channel's rate; the longest overdue comes next. After each other device a
+    drive that is due has one turn. A drive whose `enable` was withdrawn comes at once. A device that is gone
+    is connected again, and its last values are kept until they are stale."""
     period_s = {d: 1.0 / _rate_hz(d) for d in devices}
+    enabled = {d: False for d in devices if d.drives}
+    had_turn: set[Device] = set()  # drives, since the last turn of another device
+
+    def is_withdrawn(device: Device) -> bool:
+        """Return whether a drive still has to be disabled."""
+        return enabled.get(device, False) and not _command(device, board)[1]
+
+    def is_first(device: Device) -> bool:
+        """Return whether a drive goes before the others."""
+        is_due = device.drives and device not in had_turn and due_s[device] <= time.monotonic()
+        return is_due or is_withdrawn(device)
+
     samples = {d: Sample(len(d.binding.channels.names)) for d in devices}
     due_s = dict.fromkeys(devices, time.monotonic())
     for device in devices:
         samples[device].status[device.roles] = STALE
+        device.is_urgent = partial(_any, is_withdrawn, [d for d in enabled if d is not device])
     while not stop.is_set():
-        device = min(devices, key=lambda d: due_s[d])
-        if stop.wait(max(0.0, due_s[device] - time.monotonic())):
+        device = min(devices, key=lambda d: (not is_first(d), due_s[d]))
+        if not is_first(device) and stop.wait(max(0.0, due_s[device] - time.monotonic())):
             break
-        _poll(device, samples[device], board)
+        is_enabled = _poll(device, samples[device], board)
+        if device.drives:
+            enabled[device] = is_enabled
+            had_turn.add(device)
+        else:
+            had_turn.clear()
         board.post(samples[device], device)
         due_s[device] += period_s[device] if device.up else RECONNECT_S
         due_s[device] = max(due_s[device], time.monotonic())  # a slow answer: drop the polls that were missed
@@ -59,17 +79,28 @@ def _rate_hz(device: Device) -> float:
     return max(rates + ([amplifier.command_hz] if amplifier is not None else []))
 
 
-def _poll(device: Device, sample: Sample, board: Board) -> None:
+def _any(is_so: Callable[[Device], bool], devices: list[Device]) -> bool:
+    return any(map(is_so, devices))
+
+
+def _command(device: Device, board: Board) -> tuple[float, bool]:
+    """Return the loop's command of a drive; disabled where the last one is old."""
+    drive, enable, sent_s = board.command(device)
+    is_fresh = time.monotonic() - sent_s <= COMMAND_AGE_S
+    return (drive, enable) if is_fresh else (0.0, False)
+
+
+def _poll(device: Device, sample: Sample, board: Board) -> bool:
+    """Read a device and write a drive's command; return whether the drive was left enabled."""
     try:
         if not device.up:
             device.connect()
             device.up = True
         device.poll(sample)
         if device.drives:
-            drive, enable, sent_s = board.command(device)
-            now_s = time.monotonic()
-            is_fresh = now_s - sent_s <= COMMAND_AGE_S
-            device.write(drive if is_fresh else 0.0, enable and is_fresh, now_s)
+            drive, enable = _command(device, board)
+            device.write(drive, enable, time.monotonic())
+            return enable
     except (HardwareError, OSError) as e:
         if device.up:
             device.counts["reconnections"] += 1
@@ -78,6 +109,7 @@ def _poll(device: Device, sample: Sample, board: Board) -> None:
         if device.drives:
             device.fail_all(sample, f"{e}; reconnecting")
         device.miss_all(f"{e}; reconnecting")
+    return False
 
 
 def run_poller(devices: list[Device], board_name: str) -> None:

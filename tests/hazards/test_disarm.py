@@ -1,0 +1,219 @@
+"""From `disarm`, and from a fault, to the safe command on the wire, while devices beside the drive are dead.
+
+The daemon is a process of its own; drive, encoders and thermometers are emulated at their wires. What is
+timed is the arrival of the command at the drive, in several phases of its neighbours' time limits.
+"""
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+
+import pytest
+
+from tests.daemon.process import Daemon, wait
+from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port
+from tests.devices.test_drives import AXIS_DBC, Drive, modbus
+from tests.hal.conftest import make_settings
+from tests.hazards.harness import ROWS, Row
+from tests.rigs.wire import HEAD, SENSED, TORQUE, WireRig
+from thermoctl.files import yamlfile
+from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.rig.make import disable_amplifier, driving_devices
+
+PHASES = 8
+ANSWER_S = 0.4  # time limit of the dead units, below the 0.5 s in which the drive has to answer
+SPARE = [f"spare_{k}" for k in range(1, 4)]
+THERMOMETER = f"""{HEAD}bus: modbus
+modbus: {{timeout_s: {ANSWER_S}}}
+channels:
+  t0: {{register: 0, type: int16, scale: 0.01, unit: degC, range: [-50, 200], rate_hz: 20, stale_after_s: 3}}
+"""
+METER = f"""{HEAD}bus: serial-lines
+text: {{pattern: '(?P<t>[-0-9.]+)$', request: 'T?', request_hz: 10}}
+channels:
+  t0: {{field: t, unit: degC, range: [-50, 200], rate_hz: 10, stale_after_s: 3}}
+"""
+
+
+def dead_host(stack, kind):
+    """Return the port of a host that refuses, whose connection is never made, or that never answers."""
+    if kind == "refused":
+        return free_port()
+    listener = stack.enter_context(socket.socket())
+    listener.bind(("127.0.0.1", 0))
+    listener.listen(0 if kind == "black hole" else 64)
+    for _ in range(3 if kind == "black hole" else 0):  # the backlog is full: the next one waits
+        waiting = stack.enter_context(socket.socket())
+        waiting.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            waiting.connect(listener.getsockname())
+    return listener.getsockname()[1]
+
+
+class Neighbours:
+    """A rig of one axis with dead devices beside its drive, and its daemon.
+
+    servo: '' for a drive on CAN; rtu, tcp: a unit of a Modbus line or gateway."""
+
+    def __init__(self, folder, dead, servo):
+        self.stack = contextlib.ExitStack()
+        self.rig = WireRig(folder, {"": ("coil", "bench", *SPARE)})
+        self.stack.callback(self.rig.close)
+        self.rig.registers = self.rig.registers[:3]
+        (folder / "thermometer.yaml").write_text(THERMOMETER)
+        (folder / "meter.yaml").write_text(METER)
+        self.axis = self.rig.axes[""]
+        lines = self.rig.devices().splitlines()
+        if servo:
+            lines[:1] = self.servo(folder, servo)
+        lines += [f"    - {self.dead(folder, kind, k)}" for k, kind in enumerate(dead)]
+        self.rig.devices = lambda: "\n".join(lines)
+        self.safe_s, self.sense, drive = 0.0, self.axis.plant.sense, self.axis.torque
+        request = drive.request
+
+        def noted(state):
+            """Note the first command that disables."""
+            if state == 1 and drive.state == 8:
+                self.safe_s = time.monotonic()
+            request(state)
+
+        drive.request = noted
+        self.daemon = Daemon(self.rig.rig_file())
+        self.stack.callback(self.daemon.kill)
+
+    def servo(self, folder, kind):
+        """Return the devices of a drive on a Modbus port; the encoders stay on CAN."""
+        drive, wire, profile, self.port, report = modbus(folder)
+        if kind == "tcp":
+            wire.close()
+            wire = Port(ModbusLine({3: wire.take.__self__.units[3]}, False).take)
+            self.port = f"tcp:127.0.0.1:{wire.number}"
+        self.stack.callback(wire.close)
+        (folder / "servo.yaml").write_text(profile)
+        self.axis.torque, frames = drive, self.axis.frames
+        self.axis.frames = lambda: [report(), frames()][1]
+        sensed = ", ".join(f"{c}: {r}" for c, r in SENSED.items())
+        return [
+            f"    - {{name: drive, profile: servo.yaml, port: '{self.port}', address: 3, "
+            "roles: {axis: amplifier_state, error: amplifier_fault}}",
+            f"    - {{name: encoders, profile: encoders.yaml, port: 'slcan:{folder}/can@1000000', address: 3, "
+            f"roles: {{{sensed}}}}}",
+        ]
+
+    def dead(self, folder, kind, k):
+        """Return the item of a dead device."""
+        if kind in ("silent", "unplugged"):
+            if kind == "silent":
+                self.stack.callback(Port(lambda data: b"", folder / f"meter{k}").close)
+            return f"{{name: dead{k}, profile: meter.yaml, port: {folder}/meter{k}, roles: {{t0: {SPARE[k]}_c}}}}"
+        port, address = self.port if kind == "unit" else "", 10 + k
+        port = port or f"tcp:127.0.0.1:{dead_host(self.stack, kind)}"
+        return f"{{name: dead{k}, profile: thermometer.yaml, port: '{port}', address: {address}, roles: {{t0: {SPARE[k]}_c}}}}"
+
+    def worst_s(self, stop):
+        """Return the longest time from `stop` to the safe command at the drive."""
+        found = []
+        for phase in range(PHASES):
+            self.axis.plant.sense = self.sense
+            self.daemon.armed()
+            wait(lambda: self.axis.torque.state == 8, "driven")
+            ticks = self.daemon.ask("status")["ticks"] + 30 + 13 * phase  # of 10 ms
+            wait(lambda last=ticks: self.daemon.ask("status")["ticks"] > last, "another phase")
+            begin = time.monotonic()
+            stop()
+            wait(lambda since=begin: self.safe_s > since, "the safe command")
+            found.append(self.safe_s - begin)
+        return max(found)
+
+    def disarm(self):
+        assert self.daemon.ask("disarm")["ok"]
+
+    def fault(self):
+        """Let the encoder read far outside its range."""
+        self.axis.plant.sense = lambda role: 1.5e6 if role == "position_um" else self.sense(role)
+
+
+CASES = {
+    "drive on CAN, all alive": ([], ""),
+    "drive on CAN; a serial meter silent, one unplugged": (["silent", "unplugged"], ""),
+    "drive on CAN; Modbus hosts refused, black-holed, half-open": (
+        ["refused", "black hole", "half-open"],
+        "",
+    ),
+    "drive on Modbus RTU, all alive": ([], "rtu"),
+    "drive on Modbus RTU; a unit of its line silent": (["unit"], "rtu"),
+    "drive on Modbus RTU; three units of its line silent": (["unit"] * 3, "rtu"),
+    "drive on Modbus TCP; hosts refused, black-holed, half-open": (
+        ["refused", "black hole", "half-open"],
+        "tcp",
+    ),
+    "drive on Modbus TCP; three units of its gateway silent": (["unit"] * 3, "tcp"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_a_disarm_waits_for_no_neighbour(tmp_path, case):
+    rig = Neighbours(tmp_path, *CASES[case])
+    with rig.stack:
+        disarm_s, fault_s = rig.worst_s(rig.disarm), rig.worst_s(rig.fault)
+        assert max(disarm_s, fault_s) < ANSWER_S / 2
+        begin = time.monotonic()
+        assert rig.daemon.stop() == 0
+        stop_s = time.monotonic() - begin
+    figures = f"disarm {disarm_s * 1e3:.0f} ms, fault {fault_s * 1e3:.0f} ms; daemon ended in {stop_s:.1f} s"
+    ROWS.append(Row("Disarm", case, f"{ANSWER_S / 2 * 1e3:.0f} ms", figures, "safe command at the drive", ""))
+
+
+def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
+    """The loop is gone; the first drive's host makes no connection for its time limit of a second."""
+    heard, drive = threading.Event(), Drive()
+    (tmp_path / "axis.dbc").write_text(AXIS_DBC)
+    channels = TORQUE.index("  position:")
+    (tmp_path / "torque.yaml").write_text(TORQUE[:channels].replace("axis.dbc", str(tmp_path / "axis.dbc")))
+    wire = modbus(tmp_path)[1:3]
+    (tmp_path / "servo.yaml").write_text(wire[1])
+
+    def node(frame):
+        if frame[0] == 3 << 5 | 7 and struct.unpack("<I", frame[2])[0] == 1:
+            heard.set()
+        return [(3 << 5 | 1, False, struct.pack("<IB3x", 0, drive.state))]
+
+    can = Port(SlcanAdapter(node).take, tmp_path / "can")
+    with contextlib.ExitStack() as stack:
+        stack.callback(can.close)
+        stack.callback(wire[0].close)
+        text = (
+            f"[{{name: dead, profile: {tmp_path}/servo.yaml, port: 'tcp:127.0.0.1:{dead_host(stack, 'black hole')}', "
+            "roles: {axis: amplifier_state, error: amplifier_fault}}, "
+            f"{{name: alive, profile: {tmp_path}/torque.yaml, port: 'slcan:{tmp_path}/can', address: 3, "
+            "roles: {state: amplifier_state, error: amplifier_fault}}]"
+        )
+        settings = make_settings(tmp_path, backend="devices", devices=tuple(yamlfile.loads(text).value))
+        driving_devices(settings)  # loads the libraries, as the start of the daemon does
+        failed = []
+
+        def act():
+            try:
+                disable_amplifier(settings)
+            except HardwareError as e:
+                failed.append(str(e))
+
+        begin, thread = time.monotonic(), threading.Thread(target=act)
+        thread.start()
+        assert heard.wait(10)
+        took_s = time.monotonic() - begin
+        thread.join()
+        assert took_s < 0.9 and len(failed) == 1 and failed[0].startswith("dead: tcp:")
+    ROWS.append(
+        Row(
+            "Disarm",
+            "loop killed; the first of two drives on a black-holed host",
+            "0.9 s",
+            f"the other's command after {took_s * 1e3:.0f} ms",
+            "by the supervisor",
+            f"`{failed[0][:60]}`",
+        )
+    )
