@@ -7,6 +7,7 @@ in which the link or a slave fails, and the way back.
 import contextlib
 import math
 import sys
+import threading
 import time
 
 import pytest
@@ -234,6 +235,50 @@ def test_a_disarm_does_not_wait_for_a_slave_that_is_brought_back(cables, tmp_pat
             rig.enable = True
             rig.until(lambda: cable.ask(1, "output") == 100)
         assert worst_s < bus.UP_S / 4
+
+
+@wire
+def test_two_slaves_that_are_lost_at_once_come_back_and_the_drive_stays_off(cables, tmp_path):
+    """The drive trips while both are brought back."""
+    cable = cables(Drive, Terminal)
+    with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable, more=', stale_after_s: 0.3')}]") as rig:
+        rig.drive, rig.enable = 0.2, True
+        rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
+        for slave in (1, 2):
+            cable.ask(slave, "stuck", SAFEOP)
+            cable.ask(slave, "fail", SAFEOP, 0x1A)
+        rig.until(lambda: rig.status("amplifier_state") == "ERROR" and rig.status("coil_c") == "STALE")
+        rig.until(lambda: cable.ask(1, "output") == 0)
+        rig.enable = False
+        for slave in (1, 2):
+            cable.ask(slave, "stuck", 0)
+        begin_s = time.monotonic()
+        rig.until(lambda: rig.status("amplifier_state") == rig.status("coil_c") == "OK")
+        print(f"both back after {time.monotonic() - begin_s:.2f} s")
+        assert cable.ask(1, "output") == 0 and cable.ask(1, "enabled_count") == 1
+        rig.enable = True
+        rig.until(lambda: cable.ask(1, "output") == 100)
+
+
+@wire
+def test_a_return_that_hangs_does_not_hold_its_line(cables, tmp_path, monkeypatch):
+    """The last user leaves while the thread of another slave does not end."""
+    cable, go_on = cables(Drive, Terminal), threading.Event()
+    revive = bus.EthercatBus._revive
+    with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable, more=', stale_after_s: 0.3')}]") as rig:
+        rig.drive, rig.enable = 0.2, True
+        rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
+        monkeypatch.setattr(bus.EthercatBus, "_revive", lambda *a: (go_on.wait(60), revive(*a)))
+        monkeypatch.setattr(bus, "UP_S", 0.5)
+        cable.ask(2, "fail", SAFEOP, 0x1A)
+        rig.until(lambda: "is being brought back" in problem(rig, "coil_c"))
+        cable.ask(1, "fail", SAFEOP, 0x1A)
+        rig.until(lambda: "still being brought back" in problem(rig, "amplifier_state"), "its error")
+        assert rig.status("amplifier_state") == "ERROR" and cable.ask(1, "output") == 0
+        rig.enable = False
+        go_on.set()
+        rig.until(lambda: rig.status("amplifier_state") == rig.status("coil_c") == "OK")
+        assert cable.ask(1, "output") == 0 and cable.ask(1, "enabled_count") == 1
 
 
 @wire

@@ -65,6 +65,8 @@ class EthercatBus:
         """Open and configure the bus for its first user, or bring this slave back.
 
         slaves: set-up of every slave that a device of the interface describes. Raises HardwareError."""
+        if self._master is not None and self._ending.is_set():
+            self._end()
         if self._master is None:
             self.described = {s.position: s for s in slaves}
             self._timeout_us = round(US * max(s.spec.timeout_s for s in self.described.values()))
@@ -77,13 +79,20 @@ class EthercatBus:
         """End the use of a slave; its last user sends every slave to INIT and closes the interface."""
         self.users.discard(position)
         if not self.users and self._master is not None:
+            self._ending.set()
             if self._back is not None:
-                self._ending.set()  # the thread uses the master that is closed below
-                wait([self._back[1]])
+                wait([self._back[1]], UP_S)
             with contextlib.suppress(Exception):  # the link may be gone
                 self._master.state = INIT
                 self._master.write_state()
-            self._close()
+            with contextlib.suppress(HardwareError):  # `join` tries again
+                self._end()
+
+    def _end(self) -> None:
+        """Close, unless the thread still uses the master. Raises HardwareError."""
+        if self._back is not None and not self._back[1].done():
+            raise HardwareError(f"{self.interface}: slave {self._back[0]} is still being brought back")
+        self._close()
 
     def reset(self, position: int) -> None:
         """Send every slave to INIT, which disables a drive, and close. Raises HardwareError."""
