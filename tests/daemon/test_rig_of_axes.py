@@ -1,13 +1,21 @@
 """A rig file with axes: what each axis gets, and the mistakes that are told with their place."""
 
 import json
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
+from tests.daemon.process import wait
 from tests.rigs.axes import simulated_axes
 from thermoctl import cli
 from thermoctl.configuration.settings import load_rig, load_settings
+from thermoctl.daemon.control_socket import ask
+from thermoctl.daemon.lock import holder
 from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.files.yamlfile import InputError
 
@@ -132,3 +140,63 @@ def test_every_command_of_a_daemon_knows_its_axis(tmp_path, capsys):
     assert {f["rig"] for f in found} == {"stage-x", "stage-y"}
     full = next(f["path"] for f in found if f["rig"] == "stage-y" and "10hz" not in f["path"])
     assert cli.main(["replay", full]) == 0 and "bit for bit" in capsys.readouterr().out
+
+
+@pytest.fixture
+def running(tmp_path):
+    """The rig file and the settings of a daemon with two axes, y armed."""
+    path = simulated_axes(tmp_path, more="  late_s: 10\n")
+    path.write_text(path.read_text().replace("    hal: {seed: 2}", "    control: {kp: 0.001}"))
+    assert run("start", path) == 0
+    assert run("arm", path, "--axis", "y") == 0
+    yield path, load_rig(path)
+    assert run("stop", path) == 0
+
+
+def of_axes(rig, key):
+    """A number of the status of each axis."""
+    return [ask(part.socket.path, {"command": "status"}, 30.0)[key] for part in rig.axes]
+
+
+def test_a_reload_that_one_axis_refuses_changes_no_axis(running, capsys):
+    path, rig = running
+    good, log = path.read_text(), path.parent / "rig.log"
+    bad = [
+        ("kp: 0.001}", "kp: 0.01}", "the output of the armed rig would jump"),
+        ("kp: 0.001}", "kp: -1}", "control.kp"),
+    ]
+    for old, new, why in bad:
+        path.write_text(good.replace(old, new).replace("kp: 0.001, ti_s", "kp: 0.0012, ti_s"))
+        capsys.readouterr()
+        assert run("reload", path) == 2
+        said = capsys.readouterr().err
+        assert why in said and said.count("\n") == 1
+        before = log.read_text().count("reload error=")
+        os.kill(holder(rig), signal.SIGHUP)
+        wait(lambda n=before: log.read_text().count("reload error=") > n, "the refusal")
+        assert why in log.read_text().splitlines()[-1]
+        assert of_axes(rig, "generation") == [0, 0]
+    path.write_text(good.replace("kp: 0.001, ti_s", "kp: 0.0012, ti_s"))
+    os.kill(holder(rig), signal.SIGHUP)
+    wait(lambda: of_axes(rig, "generation") == [1, 1], "the reload of both")
+    assert run("reload", path) == 0 and of_axes(rig, "generation") == [2, 2]
+
+
+def test_a_disarm_reaches_each_axis_although_one_gives_no_answer(running, capsys):
+    path, rig = running
+    children = sorted(psutil.Process(holder(rig)).children(), key=lambda p: (p.create_time(), p.pid))
+    commands_x = children[2]  # loop, recorder x, commands x
+    commands_x.suspend()
+    try:
+        begin, status = time.monotonic(), []
+        thread = threading.Thread(target=lambda: status.append(run("disarm", path)))
+        thread.start()
+        y = rig.axes[1].socket.path
+        wait(lambda: ask(y, {"command": "status"})["state"] != "ARMED", "y is disarmed")
+        took_s = time.monotonic() - begin
+        thread.join()
+        assert status == [2] and took_s < 2.0
+        print(f"y disarmed after {took_s:.2f} s")
+    finally:
+        commands_x.resume()
+    assert "no answer within" in capsys.readouterr().err

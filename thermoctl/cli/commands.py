@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import sys
 from pathlib import Path
@@ -59,7 +60,7 @@ def call(command: Command, args: argparse.Namespace) -> int:
         if command.name in SAFE:
             args.settings = started(args.settings)
         if each and args.settings.axes:
-            return _each_axis(function, takes, args)
+            return _each_axis(command.name, function, takes, args)
     return (function(*(getattr(args, t) for t in takes)) if takes else function(args)) or 0
 
 
@@ -78,12 +79,25 @@ def takes_axis(command: Command) -> bool:
     return CONFIG in command.arguments and command.name not in ALL_AXES
 
 
-def _each_axis(function: Any, takes: list[str], args: argparse.Namespace) -> int:
-    """Run a command for every axis; return the largest exit status."""
-    statuses = []
-    for part in args.settings.axes:
+def _each_axis(name: str, function: Any, takes: list[str], args: argparse.Namespace) -> int:
+    """Run a command for every axis; return the largest exit status.
+
+    A `disarm` reaches every axis before the first answer. A `reload` that one axis refuses is none."""
+    from thermoctl.daemon.control_socket import refused_reload, tell
+
+    statuses, axes = [], args.settings.axes
+    for part in axes if name == "disarm" else ():
+        with contextlib.suppress(InputError):  # the command itself says it
+            tell(part.socket.path, {"command": "disarm"})
+    if name == "reload" and (why := refused_reload(part.socket.path for part in axes)):
+        raise InputError(why)
+    for part in axes:
         args.settings = part
         if not getattr(args, "json", False):
             print(f"axis {part.axis}:", flush=True)
-        statuses.append(function(*(getattr(args, t) for t in takes)) or 0)
+        try:
+            statuses.append(function(*(getattr(args, t) for t in takes)) or 0)
+        except InputError as e:  # the other axes have to be disarmed all the same
+            print(f"thermoctl: {e}", file=sys.stderr)
+            statuses.append(2)
     return max(statuses)

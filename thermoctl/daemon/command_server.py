@@ -99,6 +99,7 @@ class Commands:
             "disarm": self._disarm,
             "setpoint": self._setpoint,
             "reload": self._reload,
+            "may_reload": self._may_reload,
             "gains": partial(self._gains, holds),
         }
         action = actions.get(name)
@@ -262,6 +263,10 @@ class Commands:
             return self._result("ARMED", "setpoint not taken, it counts only when armed")
         self._send(arming.SETPOINT, float(value))
         return self._result("ARMED", "setpoint not taken")
+
+    def _may_reload(self, request: dict[str, Any]) -> dict[str, Any]:
+        self._refuse_jumps(self.reload_settings(self.settings, self.started)[1])
+        return {"ok": True}
 
     def _reload(self, request: dict[str, Any]) -> dict[str, Any]:
         settings, parameters, applied, restart = self.reload_settings(self.settings, self.started)

@@ -10,7 +10,7 @@ import contextlib
 import json
 import select
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,24 @@ class Connection:
             demo.connect(str(rig.with_suffix(".sock")))
             return f"; a demo runs here on a rig of its own: --config {rig}"
         return ""
+
+
+def tell(path: Path | str, request: dict[str, Any]) -> None:
+    """Send one request to the daemon at `path`, and wait for no answer. Raises InputError."""
+    with Connection(path) as connection, connection._answering():
+        connection.socket.sendall(json.dumps(request).encode() + b"\n")
+
+
+def refused_reload(paths: Iterable[Path | str], timeout_s: float = 3.0) -> str:
+    """Return why an axis would refuse a reload, '' where none would: then nothing is half applied."""
+    for path in paths:
+        try:
+            answer = ask(path, {"command": "may_reload"}, timeout_s)
+        except InputError as e:
+            answer = {"ok": False, "error": str(e)}
+        if not answer["ok"]:
+            return f"axis {answer.get('axis') or path}: {answer['error']}; no axis was changed"
+    return ""
 
 
 def ask(path: Path | str, request: dict[str, Any], timeout_s: float = 3.0) -> dict[str, Any]:

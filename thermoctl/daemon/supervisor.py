@@ -27,7 +27,7 @@ from functools import partial
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
-from thermoctl.daemon.control_socket import ask
+from thermoctl.daemon.control_socket import ask, refused_reload
 from thermoctl.daemon.journal import Log, Watcher
 from thermoctl.daemon.lock import hold, is_retaken
 from thermoctl.daemon.processes import (
@@ -252,10 +252,13 @@ def _reload(settings: Settings, log: Log) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     loops.die_with_parent()
+    if settings.axes and (why := refused_reload([part.socket.path for part in settings.axes], RELOAD_S)):
+        log("reload", error=why)
+        return EXIT_FAILED
     for part in settings.parts:
         try:
             answer = ask(part.socket.path, {"command": "reload"}, RELOAD_S)
-            log("reload", axis=part.axis or None, **answer)
+            log("reload", **{"axis": part.axis or None, **answer})
         except InputError as e:
             log("reload", axis=part.axis or None, error=e)
     return EXIT_OK
