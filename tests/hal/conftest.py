@@ -25,7 +25,7 @@ WIRING = """
   stale_after_s: 0.1     # the rig and the reader are threads of one process: either may stall for tens of ms
   roles: {{position: position_um}}
 - name: drive
-  profile: drive-cia402.yaml
+  profile: "{dir}/drive-cia402.yaml"
   port: "slcan:{dir}/can"
   stale_after_s: 0.1
   watchdog_s: 0.2
@@ -110,6 +110,12 @@ class Wire:
 def wired(tmp_path):
     """Settings of the four wired devices, not running."""
     text = WIRING.format(dir=tmp_path, port=free_port())
+    devices, node = CONFIG / "devices", "  node_id: 5\n"
+    drive = (devices / "drive-cia402.yaml").read_text()
+    patient = drive.replace(node, f"{node}  sdo_timeout_s: 2\n")  # both ends are threads of one process
+    assert patient != drive
+    (tmp_path / "drive-cia402.yaml").write_text(patient)
+    (tmp_path / "drive-cia402.eds").write_bytes((devices / "drive-cia402.eds").read_bytes())
     return make_settings(
         tmp_path, backend="devices", devices=tuple(yamlfile.loads(text, "wiring.yaml").value)
     )

@@ -1,12 +1,15 @@
 """Interfaces of python-can as they tell bus-off: by a state, an error frame, or an error of their own."""
 
 import queue
+import struct
 import time
 
 import can
 import pytest
 
 from tests.devices.harness import HEAD, Rig
+from tests.devices.test_drives import AXIS_DBC
+from tests.rigs.wire import TORQUE
 from thermoctl_hal.can import bus as module
 from thermoctl_hal.can.bus import BUS_OFF, open_can
 
@@ -159,3 +162,35 @@ def test_own_frames_that_an_interface_hands_back_are_not_taken(monkeypatch):
         found = port.receive()
     port.close()
     assert found == [(0x205, b"b")]
+
+
+def test_a_disable_that_a_full_queue_refused_goes_out_in_the_next_tick(tmp_path, monkeypatch):
+    """Before, it came with the repetition after 0.1 s, and the drive drove on until then."""
+    monkeypatch.setattr(can, "Bus", lambda channel, **more: Interface(channel, **more))
+    monkeypatch.setattr(module, "READ_S", 0.01)
+    tmp_path.joinpath("axis.dbc").write_text(AXIS_DBC)
+    tmp_path.joinpath("torque.yaml").write_text(TORQUE[: TORQUE.index("  position:")])
+    text = (
+        "[{name: drive, profile: torque.yaml, port: 'pcan:PCAN_USBBUS1@500000', address: 3, "
+        "roles: {state: amplifier_state, error: amplifier_fault}}]"
+    )
+    with Rig(tmp_path, text) as rig:
+        bus = Interface.current
+
+        def is_driven(state):
+            """The drive's heartbeat, and whether our command goes out."""
+            bus.arriving.put(
+                can.Message(arbitration_id=0x61, data=struct.pack("<IB3x", 0, state), is_extended_id=False)
+            )
+            return any(m.arbitration_id == 0x6E and any(m.data) for m in bus.sent)
+
+        rig.until(lambda: is_driven(1) or rig.status("amplifier_state") == "OK")
+        rig.drive, rig.enable = 0.5, True
+        rig.until(lambda: is_driven(8))
+        rig.enable, bus.refuses = False, can.CanOperationError("The transmit queue is full")
+        for _ in range(5):
+            rig.tick()
+        bus.refuses = None
+        bus.sent.clear()
+        rig.tick()
+        assert [(m.arbitration_id, any(m.data)) for m in bus.sent] == [(0x6E, False), (0x67, True)]

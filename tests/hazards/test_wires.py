@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import os
 import select
 import socket
@@ -15,7 +16,7 @@ import types
 import numpy as np
 import pytest
 
-from tests.hazards.harness import ROOT, HazardRig, say
+from tests.hazards.harness import ROOT, ROWS, HazardRig, Row, say
 from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import ROLE, Sample
 from thermoctl_hal.base.wire import Framer
@@ -29,6 +30,23 @@ ENCODER, DRIVE = ("position_um",), ("amplifier_state", "amplifier_fault", "suppl
 
 FRAME = struct.Struct("=IB3x8s")  # struct can_frame of the kernel
 ERROR_FRAME = FRAME.pack(0x2000_0040, 8, bytes(8))  # CAN_ERR_FLAG | CAN_ERR_BUSOFF
+OTHER_ERROR = FRAME.pack(0x2000_0008, 8, bytes(8))  # CAN_ERR_PROT: what a wrong bit rate gives
+PASSIVE = FRAME.pack(0x2000_0004, 8, b"\0\x20") + FRAME.pack(0x2000_0004, 8, b"\0\x40")
+
+
+class Gate:
+    """The driver's end of a KernelBus, which takes no frames while its queue is full."""
+
+    def __init__(self, bus):
+        self.bus = bus
+
+    def __getattr__(self, name):
+        return getattr(self.bus.theirs, name)
+
+    def send(self, data):
+        if self.bus.full:
+            raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+        return self.bus.theirs.send(data)
 
 
 class KernelBus:
@@ -36,7 +54,7 @@ class KernelBus:
     passes either way. (The kernel's own CAN runs in a guest: make test-qemu.)"""
 
     def __init__(self):
-        self.off, self.master = False, -1
+        self.off, self.full, self.master = False, False, -1
 
     def plug(self):
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -49,7 +67,7 @@ class KernelBus:
 
     def open(self, channel, interface, bitrate, can_filters, receive_own_messages):
         """In place of can.Bus."""
-        return types.SimpleNamespace(socket=self.theirs, shutdown=lambda: None)
+        return types.SimpleNamespace(socket=Gate(self), shutdown=lambda: None)
 
     def receive(self):
         data = b""
@@ -390,8 +408,6 @@ def test_single_errors_are_survived(wired):
         and lost <= 2 * spoiled
         and worst < 0.5
     )
-    from tests.hazards.harness import ROWS, Row
-
     ROWS.append(
         Row(
             "Wires",
@@ -441,33 +457,77 @@ def test_the_adapter_takes_no_more_data(wired):
     say("Wires", "CAN: the adapter hangs", 25, ticks, found, way, jump)
 
 
-def test_bus_off(quick, tmp_path, monkeypatch):
-    """The kernel's error frame, and then nothing passes: named as such, the drive's own watchdog stops it."""
+@pytest.fixture
+def on_socket(quick, tmp_path, monkeypatch):
+    """The wired rig on SocketCAN's frames."""
     bus = KernelBus()
     monkeypatch.setattr("can.Bus", bus.open)
-    rig = WiredRig(quick, tmp_path, bus)
-    try:
-        rig.settle(lambda: rig.state == "READY")
+    r = WiredRig(quick, tmp_path, bus)
+    r.settle(lambda: r.state == "READY")
+    yield r
+    r.close()
 
-        def begin(wires):
-            bus.ours.send(ERROR_FRAME)
-            bus.off = True
 
-        def comes_back(limit_s=20.0, again=rig.comes_back):
-            bus.off = False
-            return again(limit_s)
+def bus_off(wires):
+    """The kernel's error frame, and then nothing passes."""
+    wires.adapter_port.ours.send(ERROR_FRAME)
+    wires.adapter_port.off = True
 
-        rig.comes_back = comes_back
-        happens(
-            rig,
-            "CAN: bus-off",
-            {"amplifier_error"},
-            2,
-            begin,
-            "CAN bus-off: check wiring, termination and bitrate",
-        )
-    finally:
-        rig.close()
+
+def shorter(data):
+    """The drive's TPDO 1 with 6 of its 8 bytes."""
+    return b"".join(FRAME.pack(i, 6 if i == 0x185 else n, d) for i, n, d in FRAME.iter_unpack(data))
+
+
+@pytest.mark.parametrize(
+    "hazard,expected,limit,begin,cause",
+    [
+        ("bus-off", {"amplifier_error"}, 2, bus_off, "CAN bus-off: check wiring, termination and bitrate"),
+        (
+            "transmit queue full (ENOBUFS)",
+            {"amplifier_stale"},
+            25,
+            lambda w: setattr(w.adapter_port, "full", True),
+            "nobody on the bus takes frames",
+        ),
+        (
+            "wrong bit rate: error frames only",
+            {"amplifier_stale"},
+            25,
+            set_("spoil_can", lambda d: OTHER_ERROR),
+            "no heartbeat of node 5",
+        ),
+        ("TPDO of 6 bytes", {"amplifier_stale"}, 25, set_("spoil_can", shorter), "6 bytes, 8 were mapped"),
+    ],
+)
+def test_can(on_socket, hazard, expected, limit, begin, cause):
+    """The cause is named, and the drive's own watchdog stops it where no command reaches it."""
+
+    def comes_back(limit_s=20.0, again=on_socket.comes_back):
+        on_socket.wires.adapter_port.off = on_socket.wires.adapter_port.full = False
+        return again(limit_s)
+
+    on_socket.comes_back = comes_back
+    happens(on_socket, f"CAN: {hazard}", expected, limit, begin, cause)
+
+
+@pytest.mark.parametrize(
+    "hazard,more",
+    [
+        ("error-passive, then error-active", PASSIVE),
+        (
+            "20 frames a tick of another node",
+            20 * (FRAME.pack(0x186, 8, bytes(8)) + FRAME.pack(0x706, 1, b"\5")),
+        ),
+    ],
+)
+def test_can_goes_on(on_socket, hazard, more):
+    on_socket.ready_to_be_spoiled(5.0)
+    on_socket.wires.spoil_can = lambda data: more + data
+    for _ in range(1000):
+        on_socket.tick()
+        assert on_socket.state == "ARMED" and not on_socket.faults, on_socket.faults
+    ROWS.append(Row("Wires", f"CAN: {hazard}", "no fault", "no fault in 1000 ticks", "drives on", ""))
 
 
 def test_struct_sizes():

@@ -109,6 +109,10 @@ class Sequencer:
             self.state = AMP_ENABLED if wanted else AMP_DISABLED
         return messages
 
+    def send_again(self) -> None:
+        """Let the messages be due at once: the last were not taken."""
+        self._next_s = self._command_s = -math.inf
+
     def off(self) -> list[tuple[Message, float]]:
         """Return the messages that disable, in every state."""
         return [(_command(self.amplifier), 0.0), *((m, 0.0) for m in self.amplifier.disable)]

@@ -253,6 +253,13 @@ class DbcDrive(Commanded, DbcDevice):
                 "answers with this message, bind a channel of it"
             )
 
+    def write(self, drive: float, enable: bool, now_s: float) -> None:
+        """Send the messages that are due; those that a full queue refused come again in the next tick."""
+        refused = 0 if self._port is None else self._port.bad
+        super().write(drive, enable, now_s)
+        if self._port is not None and self._port.bad != refused:
+            self.sequencer.send_again()
+
     def send_message(self, message: Message, command: float) -> None:
         """Send one message. Raises OSError."""
         if self._port is None:
