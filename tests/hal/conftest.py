@@ -28,7 +28,7 @@ WIRING = """
   profile: "{dir}/drive-cia402.yaml"
   port: "slcan:{dir}/can"
   stale_after_s: 0.1
-  watchdog_s: 0.2
+  watchdog_s: 1        # as above
   roles: {{state: amplifier_state, fault: amplifier_fault, supply: supply_v}}
 - name: thermocouples
   profile: thermocouples-modbus-12.yaml

@@ -185,7 +185,7 @@ def test_a_reconnected_drive_is_set_up_anew_and_stays_off(wire, backend):
         lambda s: s.status[STATE] == OK and s.value[STATE] == AMP_DISABLED, limit_s=5.0, backend=backend
     )
     assert backend.counters()["drive.reconnections"] == 1
-    assert drive.od[0x1016, 1].value & 0xFFFF == 200  # its watchdog is set again
+    assert drive.od[0x1016, 1].value & 0xFFFF == 1000  # its watchdog is set again
 
 
 def test_close_disables_the_drive(wire):
@@ -377,9 +377,16 @@ def test_an_slcan_adapter_that_echoes_is_told_from_a_second_master(wire, echoes,
         for _ in range(1500):  # more frames than an adapter may hold back
             frames = b.counters()["drive.frames"]
             b.write(wire.drive, wire.enable)
-            # Each tick after the answer to the one before: a stall of the machine leaves no echoes behind.
-            wire.until(lambda _, n=frames: b.read(time.monotonic()) and b.counters()["drive.frames"] != n)
-            assert "0x" not in b.problem("amplifier_state")
+
+            def is_answered(_, before=frames):
+                """Each tick comes after the answer to the one before: a stall leaves no echoes behind."""
+                if b.read(time.monotonic()).status[STATE] != OK:  # lost in a stall: it is connected again
+                    b.write(wire.drive, wire.enable)
+                return b.counters()["drive.frames"] != before
+
+            wire.until(is_answered, limit_s=30.0)
+            # An echo that is taken for another master's frame costs one in 64 ticks.
+            assert b.counters()["drive.reconnections"] < 15
         assert (echo.count > 1000) is echoes
 
         def is_told(sample):
