@@ -296,7 +296,7 @@ def test_the_rows_of_a_test_are_kept_where_its_disk_is_full(quick, capsys, monke
     assert said and len(read_table(said[2])) == int(said[1]) > 20 and not (quick / "a.csv").exists()
 
 
-@pytest.mark.parametrize("damaged", ["", "\0\0\0", "nan", "-5"])
+@pytest.mark.parametrize("damaged", ["gar\nbage\n", "", "\0\0\0", "nan", "-5"])
 def test_a_damaged_note_of_the_time_reached_is_named(quick, capsys, damaged):
     """A power cut can leave it empty; the rows beside it stay as they are."""
     (quick / "short.parquet").write_text("rows")
@@ -304,6 +304,7 @@ def test_a_damaged_note_of_the_time_reached_is_named(quick, capsys, damaged):
     command = "experiment test_2 --config rig.yaml --out short.parquet --resume --yes"
     assert cli.main(command.split()) == 2
     assert "short.parquet.progress: " in (said := capsys.readouterr().err) and "start again without" in said
+    assert said.count("\n") == 1
     assert (quick / "short.parquet").read_text() == "rows"
 
 

@@ -108,7 +108,7 @@ def _reached(path: Path) -> float:
     except ValueError:
         pass
     raise InputError(
-        f"{_progress(path)}: '{text[:40]}': the seconds that {path} reached were expected; name another file by --out and start "
+        f"{_progress(path)}: {text[:40]!r}: the seconds that {path} reached were expected; name another file by --out and start "
         "again without --resume"
     )
 
