@@ -50,7 +50,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
 
 
 def places_in(case: Case, rig: Rig) -> list[Place]:
-    """Return the places of laws at nodes of the plant file. What an effect added is its own, such as a lag."""
+    """Return the places of laws at nodes of the plant file, not at those that effects added."""
     return [p for p in places(rig) if {*p.nodes} <= case.plant.nodes.keys()]
 
 

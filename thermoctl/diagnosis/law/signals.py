@@ -235,7 +235,7 @@ def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
 
 
 def _across(rig: Rig, place: Place) -> list[Signal]:
-    """Return the differences between the ends of a flow: of nodes, of positions, and of what bodies radiate."""
+    """Return the differences between the ends of a flow: nodes, positions, fourth powers of temperatures."""
     nodes, out = rig.physics.nodes, list[Signal]()
     ends = [place.source or "", place.target]
     for a, b in (ends, [rig.pairs.get(n, "") for n in ends]):
