@@ -585,6 +585,33 @@ def test_a_second_reading_of_several_bodies_is_no_signal():
     assert {"laser", "pressure"} & {s.label for s in found} == {"pressure"}
 
 
+GEAR = """
+format: thermoctl-plant/1
+title: Two wheels that a spring joins
+nodes:
+  a: {unit: rad, storage: 1, initial: 0}
+  va: {unit: rad/s, storage: 1, initial: 0}
+  b: {unit: rad, storage: 1, initial: 0}
+  vb: {unit: rad/s, storage: 1, initial: 0}
+flows:
+  turn_a: {into: a, rate: va, unit: rad/s}
+  turn_b: {into: b, rate: vb, unit: rad/s}
+  tooth: {from: va, into: vb, rate: 40 * (a - b), unit: rad/s**2}
+outputs:
+  angle: {value: a, unit: rad, noise: 0.001}
+"""
+
+
+@pytest.mark.parametrize(("offset", "centre"), [(0.0, 0.0), (-0.15, 0.0), (2.0, 2.4)])
+def test_signals_of_a_coupling_are_the_twist_and_positions_from_a_zero_that_is_near(offset, centre):
+    """Play depends on the twist; a spring about zero needed a constant beside it."""
+    rig, t = Rig(loads(GEAR), [], []), np.linspace(0, 1, 50)
+    run = {"t": t, "a": offset + 0.4 + 0.4 * np.sin(9 * t), "b": offset + 0.1 * t, "va": t, "vb": t**2}
+    found = {s.label: s for s in signals(rig, Place("vb", "va"), [run])}
+    assert found["a - b"].drives and found["va - vb"].drives
+    assert found["a"].position and found["a"].centre == pytest.approx(centre, abs=0.1)
+
+
 @pytest.mark.parametrize("drains", [False, True], ids=["feeds", "drains"])
 def test_a_pump_at_another_vessel_than_the_plant_file_says_is_told(drains):
     pump = "inputs:\n  spare: {unit: V}\n"
