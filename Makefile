@@ -249,7 +249,7 @@ laws-recordings: develop           # laws of real rigs beside the published form
 	$(BIN)/python -m tests.laws.real $(RECORDINGS)
 
 .PHONY: same-cases
-same-cases: develop                # cases of every family by the compiled loops and by those in Python: the same bytes; NUMBER=30: hours
+same-cases: develop                # cases of every family by the compiled loops and by those in Python: the same numbers; NUMBER=30: hours
 	$(BIN)/python -m pytest -m "slow or not slow" tests/concealed/test_loops.py
 	$(BIN)/python -m tests.concealed.same_cases --number $(if $(filter file,$(origin NUMBER)),30,$(NUMBER))
 

@@ -1,8 +1,9 @@
-"""Whole cases by the compiled loops and by the loops in Python: the same bytes of plant.yaml and of the recordings.
+"""Whole cases by the compiled loops and by the loops in Python: the same text, and the same numbers but for rounding.
 
     python -m tests.concealed.same_cases [--number 30] [--families heater,tanks] [--world both] [--smoke]
 
-A number of an answer may differ from the 11th digit on. Making a case by the loops in Python takes up to a minute.
+Compiled code may round otherwise: on some processors the last digit of a recording differs, and the size of an effect
+that a refit gives. Making a case by the loops in Python takes up to a minute.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from pathlib import Path
 
 from tests.concealed import generate, rigs_motion, rigs_tanks, sensors, thermal
 
-DIGITS = 1e-10  # relative difference that a number of an answer may have
+# Relative difference that a number may have: of an answer, which a refit gives, and of the other files.
+ANSWER, DIGITS = 5e-3, 1e-6
 _NUMBER = re.compile(r"-?\d+\.?\d*(?:e[-+]?\d+)?")
 
 
@@ -40,16 +42,13 @@ def difference(one: Path, other: Path) -> str | None:
         return f"other files: {one}, {other}"
     for name in names:
         a, b = (one / name).read_text(), (other / name).read_text()
-        if a == b:
-            continue
-        if name != "answer.yaml" or _NUMBER.sub("#", a) != _NUMBER.sub("#", b):
-            line = next(
-                i for i, (x, y) in enumerate(zip(a.splitlines(), b.splitlines(), strict=False)) if x != y
-            )
-            return f"{name}:{line + 1}: {a.splitlines()[line]} | {b.splitlines()[line]}"
-        for x, y in zip(map(float, _NUMBER.findall(a)), map(float, _NUMBER.findall(b)), strict=True):
-            if abs(x - y) > DIGITS * abs(x):
-                return f"{name}: {x!r} | {y!r}"
+        may = ANSWER if name == "answer.yaml" else DIGITS
+        for i, (x, y) in enumerate(zip(a.splitlines(), b.splitlines(), strict=True), 1):
+            numbers = zip(map(float, _NUMBER.findall(x)), map(float, _NUMBER.findall(y)), strict=False)
+            if _NUMBER.sub("#", x) != _NUMBER.sub("#", y) or any(
+                abs(u - v) > may * abs(u) for u, v in numbers
+            ):
+                return f"{name}:{i}: {x} | {y}"
     return None
 
 

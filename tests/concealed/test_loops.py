@@ -94,7 +94,7 @@ def test_a_lag():
         assert np.allclose(one, sensors.lag(t, y, 3.0), rtol=1e-13, atol=1e-13)
 
 
-def test_whole_cases_have_the_same_bytes():
+def test_whole_cases_have_the_same_numbers():
     for family, kind in (("tanks", "none"), ("heater", "none")):
         words = f"--number 1 --seed 5 --families {family} --kind {kind} --world open --smoke".split()
         assert [what for _, what in differences(words)] == [None]
@@ -102,6 +102,6 @@ def test_whole_cases_have_the_same_bytes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", list(generate.FAMILIES))
-def test_whole_cases_with_an_effect_have_the_same_bytes(family):
+def test_whole_cases_with_an_effect_have_the_same_numbers(family):
     words = f"--number 2 --seed 5 --families {family} --kind one --world both --smoke".split()
     assert [what for _, what in differences(words)] == [None, None]

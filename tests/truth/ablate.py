@@ -181,6 +181,11 @@ RULES: Mapping[str, Rule] = {
         {"law.contest._leading": lambda s, size: s.best},
         searches=True,
     ),
+    "near": Rule(
+        "4.6 nats below a best that leaves only noise nothing is extended",
+        {"search.beam.NEAR": float("inf")},
+        searches=True,
+    ),
     "far": Rule(
         "a law depends on no node that acts only through two others",
         {"law.signals._far": _nothing},

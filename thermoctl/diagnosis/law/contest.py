@@ -18,11 +18,11 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.free import NEAR, pays
+from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import BEATEN, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.diagnosis.search.beam import BEATEN, NEAR, Search, Searched, Weighed, grow, searched, swap
 from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError

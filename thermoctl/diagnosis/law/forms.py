@@ -206,6 +206,7 @@ def families(
                 "absolute": z.kelvin is not None,
                 "warmed": z.kelvin is not None,
                 "position": z.position,
+                "gap": z.position,
                 "input": z.recorded,
                 "loaded": z.drives,
             }
@@ -219,7 +220,7 @@ def families(
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
     """Return the tuples of signals that a form may have with z as the first one."""
-    if form.of not in ("two", "warmed", "driven", "loaded"):
+    if form.of not in ("two", "warmed", "gap", "driven", "loaded"):
         return [(z,)]
     second = [w for w in every if w != z and not w.daily and (w.drives or form.of != "driven")]
     return [(z, w) for w in second if form.name != "product" or z.label < w.label]

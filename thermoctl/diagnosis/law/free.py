@@ -22,8 +22,6 @@ from thermoctl.diagnosis.search.metric import Metric, Plain
 PIECES = 8  # number of knots of a free function of a signal
 NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
 RANKED = 40  # number of (place, signal) pairs whose free function is scored
-# Beside a best that leaves only noise, a law so many nats below is no rival: a hundredth of the probability.
-NEAR = 4.6
 # Largest ratio of a gain to its prediction beside noise, over those before: 45 refits of 14 cases.
 SPREAD = 1.15
 SEEN = 1e-6  # least singular value over the largest one; smaller ones are rounding errors

@@ -40,6 +40,8 @@ from thermoctl.plant.simulation.simulate import Excitation, SimulationError, com
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
 SURPLUS = 5.0  # nats by which an effect of no size must lead, so that the others are refitted without it
+# If the best leaves only noise, a hypothesis so many nats below is not extended: a hundredth of the probability.
+NEAR = 4.6
 # Nats below the best, from which a law is left out; for each effect allowed, also an earlier hypothesis.
 BEATEN = 10.0
 # Share of the hypotheses near the best that will be extended, for the time left that the progress states.
@@ -184,7 +186,9 @@ def grow(s: Search) -> None:
         first, *others = leaders(list(s.tried.values()), s.limits)
         # one effect more may make such a hypothesis the better one
         fewer = [w for w in others if _number(w) < _number(first)]
-        close = only_noise(s.case, first.fitted, s.limits)
+        if close := only_noise(s.case, first.fitted, s.limits):
+            near = first.score - NEAR
+            others = [w for w in others if w.score >= near or _number(w) < _number(first)]
         rounds = s.limits.effects - number - 1
         # beside the plant alone none is known
         follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
@@ -461,4 +465,5 @@ def _expected(
         return CLOSE * limits.beam * untried
     if not only_noise(case, leader, limits):
         return np.inf
-    return CLOSE * min(len(tried), limits.beam)
+    scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
+    return CLOSE * sum(score >= scores[0] - NEAR for score in scores)
