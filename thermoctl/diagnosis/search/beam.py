@@ -40,7 +40,7 @@ from thermoctl.plant.simulation.simulate import Excitation, SimulationError, com
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
 SURPLUS = 5.0  # nats by which an effect of no size must lead, so that the others are refitted without it
-# If the best leaves only noise, a hypothesis so many nats below is not extended: a hundredth of the probability.
+# If the best leaves only noise, a hypothesis so many nats below, a hundredth as likely, is not extended.
 NEAR = 4.6
 # Nats below the best, from which a law is left out; for each effect allowed, also an earlier hypothesis.
 BEATEN = 10.0
