@@ -16,6 +16,7 @@ from thermoctl.plant.recordings import read_recordings
 LAW = [
     "where",
     "expression",
+    "plain",
     "part",
     "terms",
     "forms",

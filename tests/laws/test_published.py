@@ -92,6 +92,9 @@ def test_two_laws_are_found_where_one_law_and_a_sensor_imitate_them(tmp_path):
         assert [form["form"] for form in law["forms"]] == ["product"]
         a, z, w = (law["parameters"][q]["value"] for q in ("A1", "Z1", "W1"))
         sizes[law["where"]] = a / (z * w)
+        coefficient, *read = law["plain"].replace("(", "").replace(")", "").split(" * ")
+        assert read == ["bacteria", "phages"]
+        assert float(coefficient) == pytest.approx(a / (z * w), rel=1e-3)
     assert sizes == {"bacteria": pytest.approx(-0.6, rel=0.1), "phages": pytest.approx(0.21, rel=0.1)}
     text = " ".join(sentences(result))
     assert "a law at phages of bacteria and phages and a law at bacteria of bacteria and phages" in text

@@ -19,7 +19,7 @@ from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
-from thermoctl.plant.expression import name
+from thermoctl.plant.expression import name, num
 from thermoctl.plant.simulation.simulate import Excitation, SimulationError
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
@@ -186,3 +186,30 @@ def equation(f: Fitted, law: PlacedLaw, numbers: bool = False) -> str:
         shown = f"{values[own].value:.3g}" if numbers and own in values else short
         text = re.sub(rf"\b{re.escape(own)}\b", f"({shown})" if shown.startswith("-") else shown, text)
     return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)
+
+
+def plain(f: Fitted, law: PlacedLaw) -> str | None:
+    """Return a law without the typical sizes of its signals, as -34 * position; None where forms need them.
+
+    A term that grows as a power of its signal takes them into its coefficient."""
+    terms = [_plain(t, k, f, law) for k, t in enumerate(law.proposal.terms, 1)]
+    return " + ".join(t for t in terms if t) if all(terms) else None
+
+
+def _plain(t: Term, k: int, f: Fitted, law: PlacedLaw) -> str | None:
+    text, used = t.form.text, ex.names(t.form.text)
+    if used - {*t.form.sizes, *t.form.shapes, "z", "w"} or any(s.centre for s in t.signals):
+        return None
+    own = {q: f.plant.parameters[law.own[f"{q}{k}"]].value for q in (*t.form.sizes, *t.form.shapes)}
+    z = np.array([0.5, 1.0, 2.0])
+    with np.errstate(all="ignore"):
+        once, twice = (np.asarray(ex.evaluate(text, {**own, "z": x, "w": 1.0})) for x in (z, 2 * z))
+        power = np.log2(np.divide(twice, once)) * np.ones(3)
+    if len(own) > len(t.form.shapes) + 1 or not np.allclose(power, power[0]):
+        return None
+    scale = np.prod(
+        [s.size ** (power[0] if q == "z" else 1.0) for q, s in zip("zw", t.signals, strict=False)]
+    )
+    numbers = {**own, t.form.sizes[0]: own[t.form.sizes[0]] / scale}
+    symbols = {q: num(float(f"{v:.4g}")) for q, v in numbers.items()}
+    return readable(ex.fill(text, symbols | {q: s.value for q, s in zip("zw", t.signals, strict=False)}))

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.forms import MARK
 from thermoctl.diagnosis.law.propose import Proposal
-from thermoctl.diagnosis.law.refit import equation, law_rate, laws_of
+from thermoctl.diagnosis.law.refit import equation, law_rate, laws_of, plain
 from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
 from thermoctl.diagnosis.report.words import every_law, law_sentence
 from thermoctl.files.safe_file import make_folder, write_text
@@ -41,6 +41,7 @@ def law_entry(laws: Sequence[FoundLaw], worth: Worth) -> dict[str, Any] | None:
         "where": place.where,
         "part": place.part,
         "expression": equation(f, law.placed),
+        "plain": plain(f, law.placed),
         "into": place.target,
         "from": place.source,
         "shares": {node: str(share) for node, share in place.shares},

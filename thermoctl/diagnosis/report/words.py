@@ -129,7 +129,8 @@ def law_sentence(entry: Result, head: str = "A law for it") -> str:
         f"a flow {ends}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
     )
     chances = f"probability {chance(entry['probability'])}"
-    return f"{head}: {acts}, {entry['expression']}, with {values} ({chances})."
+    short = f", that is {entry['plain']}" if entry.get("plain") else ""
+    return f"{head}: {acts}, {entry['expression']}, with {values}{short} ({chances})."
 
 
 def _likely(result: Result) -> list[Result]:
