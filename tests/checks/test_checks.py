@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 
 import numpy as np
 import pytest
@@ -462,6 +463,29 @@ def test_a_siphon_that_empties_is_no_counter():
     level = np.round(0.02 + (0.0011 * t + 0.01) % 0.0811, 4)
     columns = {"pump": np.where(t > 100, 1.1e-5, 1.0e-5), "gauge": level}
     assert "wrapped" not in {f.kind for f in checks(loads(text), [Table("run", "run.csv", t, columns)])}
+
+
+def test_a_single_wild_reading_is_no_counter():
+    """Down at the top of a swing and up again were two leaps of 1.5 times their size: a severe finding."""
+    plant, table = rig("one block")
+    wild = table.columns["temperature"].copy()
+    step = np.diff(wild)
+    top = next(k for k in range(300, 700) if step[k - 2] > 0 > step[k + 1])
+    wild[top] -= 4 * np.ptp(wild)
+    found = checks(plant, [column("temperature", lambda v: wild)(table)])
+    assert "wrapped" not in {f.kind for f in found}
+
+
+@pytest.mark.parametrize("empty", [0, 60])
+def test_the_time_of_a_leap_counts_rows_with_empty_cells(empty):
+    plant, table = rig(STAGE)
+    table = column("encoder", overflowing(0.6, 8))(table)
+    y = table.columns["encoder"].copy()
+    leaps = table.t[:-1][np.abs(np.diff(y)) > 0.5 * np.ptp(y)]
+    y[:empty] = np.nan
+    (told,) = (f for f in checks(plant, [column("encoder", lambda v: y)(table)]) if f.kind == "wrapped")
+    first = float(re.search(r"first after t = ([\d.]+) s", told.what)[1])
+    assert np.abs(leaps - first).min() < 1e-6
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -190,7 +190,7 @@ def _dead(model: Model, table: Table, excitation: Excitation, run: np.ndarray) -
             findings.append(Finding("still", table.path, what, advice))
             continue
         findings += _stuck(table, o.column, y, simulated, table.t[there], max(sd, noise.sigma))
-        findings += _wrapped(table, o.column, y, simulated, o.unit or "")
+        findings += _wrapped(table, o.column, y, simulated, table.t[there], o.unit or "")
     scales = [max(sd, noise.sigma) for sd, noise in zip(sds, noises, strict=True)]
     driving = [
         i
@@ -242,15 +242,17 @@ def moves(table: Table, column: str) -> bool:
     return bool(np.nanmax(table.columns[column]) > np.nanmin(table.columns[column]))
 
 
-def _wrapped(table: Table, column: str, y: np.ndarray, simulated: np.ndarray, unit: str) -> list[Finding]:
+def _wrapped(
+    table: Table, column: str, y: np.ndarray, simulated: np.ndarray, t: np.ndarray, unit: str
+) -> list[Finding]:
     """Find a counter that overflows, or an angle that begins again: leaps by a period against the motion.
 
     Noise alone leaps as far as it reaches: the other steps have to be far below the period. Stick-slip and
     siphons leap, too. So the period has to be a turn or a power of two of the readings' step, or the leaps go
-    both ways."""
+    both ways. A leap that is taken back at once is a bad reading."""
     steps = np.diff(y)
     far = np.flatnonzero(np.abs(steps) > 0.5 * np.ptp(y))
-    far = far[(far > 0) & (far < len(steps) - 1)]
+    far = far[(far > 0) & (far < len(steps) - 1) & ~np.isin(far - 1, far) & ~np.isin(far + 1, far)]
     if not 0 < len(far) <= len(steps) // FEW or np.abs(np.diff(simulated)).max() > 0.5 * np.ptp(y):
         return []
     before, after, leaps = steps[far - 1], steps[far + 1], steps[far]
@@ -270,7 +272,7 @@ def _wrapped(table: Table, column: str, y: np.ndarray, simulated: np.ndarray, un
     if not (sure or both):
         return []
     period = sure[0] if sure else period
-    what = f"'{column}' leaps {len(far)} times by {period:.6g} against its motion, first after t = {table.t[far[0]]:.6g} s"
+    what = f"'{column}' leaps {len(far)} times by {period:.6g} against its motion, first after t = {t[far[0]]:.6g} s"
     advice = f"A counter that overflows? Join it: numpy.unwrap(values, period={period:.6g})."
     return [Finding("wrapped", table.path, what, advice)]
 
