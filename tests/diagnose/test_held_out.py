@@ -10,11 +10,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
+from tests.plants import WIDE_BLOCK
 from thermoctl.diagnosis import result
 from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.evidence.held_out import worse, worth
+from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import loads
+from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 
@@ -114,3 +118,17 @@ def test_a_recording_set_aside_that_is_not_followed_is_told_where_nothing_is_mis
     assert note == f"the error of y is 3.8 times the noise in pat_5, set aside: {why}"
     worth.refit_only = {"y": 0.7}
     assert not result._differ(d)
+
+
+def test_wild_readings_in_a_recording_set_aside_are_left_out_there_too():
+    """Errors of it were 30 times the noise, and "they differ from the others": they stayed in these rows only."""
+    plant, tables = loads(WIDE_BLOCK), []
+    for k in range(3):
+        t, rng = np.arange(0.0, 3000.0, 5.0), np.random.default_rng(k)
+        heat = np.repeat(rng.uniform(0, 20, 20), 30)
+        table = compile_plant(plant).measure(Table(f"r{k}", "", t, {"heat": heat, "air": 22 + 0 * t}), k)
+        table.columns["T"][[77, 191, 333, 406, 555]] += 20.0
+        tables.append(table)
+    found = diagnose(plant, tables, {}, limits())
+    assert found.decision.verdict == "consistent" and found.worth.reserved
+    assert found.worth.refit_only["T"] < 1.3 * found.worth.noise["T"]

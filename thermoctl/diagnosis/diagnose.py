@@ -10,7 +10,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.evidence.fit import Fitted, closest, with_residuals
-from thermoctl.diagnosis.evidence.held_out import split, worth
+from thermoctl.diagnosis.evidence.held_out import cleaned, split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
@@ -108,6 +108,7 @@ def decided(sought: Sought) -> Diagnosis:
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
+    sought = replace(sought, reserve=tuple(cleaned(known, tried[frozenset()].fitted, sought.reserve)))
     chosen, posterior, asked = _chosen(sought, tried, physics)
     null = best = with_residuals(known, closest(known, tried[frozenset()].fitted))
     if chosen:

@@ -195,7 +195,7 @@ def case(
         d.y - model.run(d, values, np.zeros_like(dx0)).y
         for d, values, dx0 in zip(drives, null.values, null.dx0, strict=True)
     ]
-    tables, dropped = _without_outliers(tables, plant, drives, null.residuals, as_stated, noise)
+    tables, dropped = without_outliers(tables, plant, drives, null.residuals, as_stated, noise)
     drives = [dataclasses.replace(model.excitation(t), rtol=rtol) for t in tables]
     kept = [np.where(np.isfinite(d.y), e, np.nan) for d, e in zip(drives, null.residuals, strict=True)]
     null = dataclasses.replace(null, residuals=kept)
@@ -300,7 +300,7 @@ def _free_starts(plant: Plant, tables: Sequence[Table]) -> tuple[Plant, dict[str
     return dataclasses.replace(plant, nodes=nodes), off, notes
 
 
-def _without_outliers(
+def without_outliers(
     tables: Sequence[Table],
     plant: Plant,
     drives: Sequence[Excitation],
