@@ -132,3 +132,5 @@ def test_wild_readings_in_a_recording_set_aside_are_left_out_there_too():
     found = diagnose(plant, tables, {}, limits())
     assert found.decision.verdict == "consistent" and found.worth.reserved
     assert found.worth.refit_only["T"] < 1.3 * found.worth.noise["T"]
+    assert [name for name, *_ in found.case.outliers] == ["r0", "r1", "r2"]
+    assert any("T in r2 at 385" in note for note in found.case.notes)

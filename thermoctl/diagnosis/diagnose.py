@@ -108,7 +108,8 @@ def decided(sought: Sought) -> Diagnosis:
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
-    sought = replace(sought, reserve=tuple(cleaned(known, tried[frozenset()].fitted, sought.reserve)))
+    known, reserve = cleaned(known, tried[frozenset()].fitted, sought.reserve)
+    sought = replace(sought, case=known, reserve=reserve)
     chosen, posterior, asked = _chosen(sought, tried, physics)
     null = best = with_residuals(known, closest(known, tried[frozenset()].fitted))
     if chosen:

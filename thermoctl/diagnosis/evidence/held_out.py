@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import stdtr
 
-from thermoctl.diagnosis.data.case import Case, without_outliers
+from thermoctl.diagnosis.data.case import Case, outlier_note, without_outliers
 from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.plant.fitting import refit
@@ -63,13 +63,16 @@ def split(tables: Sequence[Table], held_out: Sequence[Table]) -> tuple[list[Tabl
     return list(tables[:-1]), list(tables[-1:])
 
 
-def cleaned(case: Case, null: Fitted, reserve: Sequence[Table]) -> list[Table]:
-    """Return recordings set aside without single outliers, which the others have lost, too."""
+def cleaned(case: Case, null: Fitted, reserve: Sequence[Table]) -> tuple[Case, tuple[Table, ...]]:
+    """Return recordings set aside without single outliers, and the case that notes these."""
     if case.block > 1:
-        return list(reserve)  # their means are without them
-    drives = [compile_plant(null.plant).excitation(t) for t in reserve]
+        return case, tuple(reserve)  # their means are without them
+    model = compile_plant(null.plant)
+    drives = [model.excitation(t) for t in reserve]
     errors = [errors_aside(case, null.plant, t) for t in reserve]
-    return without_outliers(reserve, case.plant, drives, errors, errors, case.noise)[0]
+    tables, wild = without_outliers(reserve, case.plant, drives, errors, errors, case.noise)
+    notes = [*case.notes, *([outlier_note(wild)] if wild else [])]
+    return dataclasses.replace(case, outliers=case.outliers + wild, notes=notes), tuple(tables)
 
 
 def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:

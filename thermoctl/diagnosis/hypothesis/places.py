@@ -53,11 +53,12 @@ def exchanging(rig: Rig) -> list[tuple[str, str]]:
     flows = rig.physics.flows.values()
     pairs = {(f.source, f.target) for f in flows if f.source in nodes and f.target in nodes}
     kinds = {n: (rig.physics.nodes[n].unit, flow_unit(rig.physics, n)) for n in nodes}
-    for a, b in combinations(nodes, 2):
-        alike = kinds[a] == kinds[b] and all(kinds[a])
-        if (b, a) not in pairs and (alike or b in _linked(a, pairs)):
-            pairs.add((a, b))
-    return sorted(pairs)
+    more = {
+        (a, b)
+        for a, b in combinations(nodes, 2)
+        if b in _linked(a, pairs) or kinds[a] == kinds[b] and all(kinds[a])
+    }
+    return sorted(pairs | {(a, b) for a, b in more if (b, a) not in pairs})
 
 
 def _linked(node: str, pairs: Collection[tuple[str, str]]) -> set[str]:
