@@ -69,9 +69,9 @@ class Fitted:
     before: tuple[Keys, float] | None  # effects and log likelihood of the hypothesis it extends
 
     @property
-    def absent(self) -> bool:
-        """Return whether a whole effect is not significant."""
-        return any(_insignificant(self, e, _none_stands) for e in self.hypothesis.effects)
+    def absent(self) -> Keys:
+        """Return the effects that are not significant."""
+        return frozenset(e.key for e in self.hypothesis.effects if _insignificant(self, e, _none_stands))
 
     @property
     def doubtful(self) -> bool:

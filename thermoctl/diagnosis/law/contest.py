@@ -49,7 +49,7 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
     s.refitted = {*tried, *s.refused}
     parents = {w.fitted.hypothesis.keys: w for w in (alone, best, *_beside_bounded(s, best))}
     for parent in parents.values():
-        if case.budget.stopped() or len(parent.fitted.hypothesis.effects) >= limits.effects:
+        if case.budget.stopped():
             continue
         if parent is not alone and only_noise(case, parent.fitted, limits):
             continue
@@ -60,7 +60,7 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         least = tuple(w.score - parent.score - near for w in rivals)
         goal = Goal(least, NEAR if quiet else 0.0, quiet)
         done = case.budget.fits_done
-        _compete(s, _laws(case, parent, alone, goal, limits, say), done)
+        _compete(s, _laws(s, parent, goal, say), done)
     if not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
         say("looking for laws at two places")
         done = case.budget.fits_done
@@ -139,40 +139,44 @@ def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
     return [top, *(s.weighed(f) for f in single if f)]
 
 
-def _laws(
-    case: Case, parent: Weighed, alone: Weighed, goal: Goal, limits: Thresholds, say: Callable[[str], None]
-) -> list[Weighed]:
-    """Return a hypothesis with the best law at each place, beside a parent and beside the plant alone.
+def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) -> list[Weighed]:
+    """Return a hypothesis with the best law at each place, beside a parent and beside parts of it.
 
     Only laws that may reach the goal are refitted.
     The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
-    them, too. There its promise is larger by what the effects gain."""
+    them, too, and without those that it makes insignificant. There its promise is larger by what they gain."""
+    case, alone = s.case, s.tried[frozenset()]
     try:
-        proposals = propose_laws(case, parent.fitted, limits)
+        proposals = propose_laws(case, parent.fitted, s.limits)
     except (SimulationError, np.linalg.LinAlgError):
         return []
-    taken = {key[1] for key in parent.fitted.hypothesis.keys if key[0] == LAW}
+    keys = parent.fitted.hypothesis.keys
+    taken = {key[1] for key in keys if key[0] == LAW}
     proposals = [p for p in proposals if p.place.where not in taken]
 
-    def refitted(base: Weighed, some: Sequence[Proposal]) -> list[tuple[Proposal, Weighed]]:
-        """Return the laws that were refitted beside a hypothesis."""
-        more = parent.score - base.score
-        tried = refits(case, base.fitted, some, replace(goal, least=tuple(x + more for x in goal.least)), say)
+    def refitted(base: Weighed) -> list[tuple[Proposal, Weighed]]:
+        """Return the laws that were refitted beside a hypothesis; beside a part of the parent, single ones."""
+        more, plant = parent.score - base.score, base.fitted.plant
+        known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
+        some = [
+            replace(p, promise=p.promise + more)
+            for p in proposals
+            if base is parent or len(p.terms) == 1 and known >= {*p.place.nodes, *_names(p)}
+        ]
+        least = replace(goal, least=tuple(x + more for x in goal.least))
+        tried = refits(case, base.fitted, some, least, say)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
-    groups = [refitted(parent, proposals)]
-    if parent is not alone:
-        more, plant = parent.score - alone.score, alone.fitted.plant
-        known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
-        single = [p for p in proposals if len(p.terms) == 1]
-        stands = [p for p in single if known >= {*p.place.nodes, *_names(p)}]
-        groups.append(refitted(alone, [replace(p, promise=p.promise + more) for p in stands]))
+    groups = [refitted(parent)]
+    absent = max(groups[0], key=lambda x: x[1].score)[1].fitted.absent if groups[0] else frozenset()
+    parts = {k: s.tried[k] for k in (keys - absent, frozenset()) if k != keys and k in s.tried}
+    groups += [refitted(base) for base in parts.values()]
     found = (
-        _best([x for x in some if x[0].place == place], limits)
+        _best([x for x in some if x[0].place == place], s.limits)
         for some in groups
         for place in {p.place: 0 for p, _ in some}
     )
-    return [w for w in found if w]
+    return [w for w in found if w and len(w.fitted.hypothesis.effects) <= s.limits.effects]
 
 
 def _names(p: Proposal) -> set[str]:
@@ -184,7 +188,7 @@ def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weigh
     """Return the likeliest law at one place whose parts are significant; None if there is none.
 
     Its `rivals` are the others that fit about as well."""
-    laws = [(p, w) for p, w in laws if not w.fitted.doubtful]
+    laws = [(p, w) for p, w in laws if not w.fitted.doubtful and not w.fitted.absent]
     if not laws:
         return None
     share = softmax(np.array([w.score for _, w in laws]))

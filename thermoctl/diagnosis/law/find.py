@@ -162,7 +162,7 @@ def refits(
             more_evidence = f.log_evidence - parent.log_evidence
             ratios.append(more_evidence / max(p.promise, 1.0))
             leader = max(leader, f, key=lambda x: x.log_likelihood)
-            if not f.absent and not at_bound(f):
+            if not at_bound(f):
                 tried.append((p, f))
             best = more_evidence - p.cost >= ahead
             ahead = max(ahead, more_evidence - p.cost)
