@@ -22,7 +22,17 @@ from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.beam import BEATEN, NEAR, Search, Searched, Weighed, grow, searched, swap
+from thermoctl.diagnosis.search.beam import (
+    BEATEN,
+    NEAR,
+    Search,
+    Searched,
+    Weighed,
+    grow,
+    rebuilt,
+    searched,
+    swap,
+)
 from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
@@ -47,12 +57,12 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
-    parents = {w.fitted.hypothesis.keys: w for w in (alone, best, *_beside_bounded(s, best))}
-    for parent in parents.values():
-        if case.budget.stopped():
+    queue, known = [alone, best, *_beside_bounded(s, best)], list[Weighed]()
+    while queue and not case.budget.stopped():
+        parent, *queue = queue
+        if parent in known or parent is not alone and only_noise(case, parent.fitted, limits):
             continue
-        if parent is not alone and only_noise(case, parent.fitted, limits):
-            continue
+        known.append(parent)
         say("looking for a law")
         quiet, many = only_noise(case, s.best.fitted, limits), len(parent.fitted.hypothesis.effects)
         rivals = [s.best if quiet else _leading(s, many + k + 1) for k in range(TERMS)]
@@ -61,6 +71,8 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         goal = Goal(least, NEAR if quiet else 0.0, quiet)
         done = case.budget.fits_done
         _compete(s, _laws(s, parent, goal, say), done)
+        if not only_noise(case, s.best.fitted, limits):
+            queue += _without_laws(s)
     if not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
         say("looking for laws at two places")
         done = case.budget.fits_done
@@ -75,6 +87,12 @@ def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:
     keys, bounds = best.fitted.hypothesis.keys, best.fitted.fit.at_bound.keys()
     bounded = [e.key for e in best.fitted.hypothesis.effects if bounds & {*e.own.values()}]
     return [s.tried[keys - {key}] for key in bounded if keys - {key} in s.tried]
+
+
+def _without_laws(s: Search) -> list[Weighed]:
+    """Return the effects of the leading hypothesis, where it has a law: beside them alone others may fit."""
+    keys = frozenset(e.key for e in s.best.fitted.hypothesis.effects if not isinstance(e, PlacedLaw))
+    return [s.tried[keys]] if keys in s.tried and keys != s.best.fitted.hypothesis.keys else []
 
 
 def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
@@ -167,16 +185,34 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
         tried = refits(case, base.fitted, some, least, say)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
-    groups = [refitted(parent)]
-    absent = max(groups[0], key=lambda x: x[1].score)[1].fitted.absent if groups[0] else frozenset()
-    parts = {k: s.tried[k] for k in (keys - absent, frozenset()) if k != keys and k in s.tried}
-    groups += [refitted(base) for base in parts.values()]
+    bases, groups = [parent], [refitted(parent)]
+    while (base := _part(s, bases[-1], groups[-1])) or alone not in bases:
+        bases.append(base or alone)
+        groups.append(refitted(bases[-1]))
     found = (
         _best([x for x in some if x[0].place == place], s.limits)
         for some in groups
         for place in {p.place: 0 for p, _ in some}
     )
     return [w for w in found if w and len(w.fitted.hypothesis.effects) <= s.limits.effects]
+
+
+def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) -> Weighed | None:
+    """Return a hypothesis without the effects that the best law beside it makes insignificant.
+
+    Where there is no room for a law, the effect that is worth least is left out; None if all may stay."""
+    effects = base.fitted.hypothesis.effects
+    absent = max(laws, key=lambda x: x[1].score)[1].fitted.absent if laws else frozenset()
+    rest = tuple(e for e in effects if e.key not in absent)
+    if len(rest) >= s.limits.effects:
+        less = [s.tried[k] for e in effects if (k := base.fitted.hypothesis.keys - {e.key}) in s.tried]
+        return max(less, key=lambda w: w.score, default=None)
+    if len(rest) == len(effects):
+        return None
+    keys = frozenset(e.key for e in rest)
+    if keys not in s.tried and (w := rebuilt(s, rest, base.fitted, base.fitted)):
+        s.keep([w])
+    return s.tried.get(keys)
 
 
 def _names(p: Proposal) -> set[str]:
