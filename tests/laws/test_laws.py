@@ -35,6 +35,7 @@ from thermoctl.diagnosis.law.refit import (
     SIMPLER,
     affordable,
     law_candidate,
+    law_rate,
     laws_of,
     refitted_law,
 )
@@ -182,6 +183,7 @@ def test_a_law_may_sit_at_a_body_that_a_finding_brought(found, part):
         Place("two", "one"),
         Place("one", None, "storage"),
         Place("one", None, "flow", ("loss_1", "loss_2"), (("two", ex.num(-0.5)),)),
+        Place("one", None, "parameter", ("G_1",), (("one", ex.num(-1.0)), ("two", ex.num(0.5)))),
     ],
 )
 def test_a_plant_with_a_law_of_any_form_at_any_place_can_be_read_again(found, place, tmp_path):
@@ -250,7 +252,7 @@ def test_a_law_of_a_conversion_acts_in_all_its_flows(tmp_path):
     table = Table("run", "", t, dict(zip(("chlorophyll", "count"), noisy, strict=True)))
     d = diagnose(loads(ECOSYSTEM), [table], {}, limits())
     place = d.law.proposal.place
-    assert (place.flows, place.target, [n for n, _ in place.shares]) == (
+    assert (place.of, place.target, [n for n, _ in place.shares]) == (
         ("gain", "grazing"),
         "grazers",
         ["algae"],
@@ -292,6 +294,117 @@ def test_flows_that_are_always_in_proportion_are_one_place(second, share, end):
         values = {q: p.value for q, p in plant.parameters.items()}
         wanted = ex.evaluate(ex.parse(f"{sign}({share[1]})"), values)
         assert (node, ex.evaluate(e, values)) == (share[0], pytest.approx(wanted))
+
+
+BRAKE = """\
+format: thermoctl-plant/1
+title: Brake of a flywheel
+inputs:
+  torque: {unit: N*m}
+  clamp: {unit: N}
+parameters:
+  mu: {value: 0.42, unit: "1", range: [0.1, 0.8]}
+  b: {value: 0.025, unit: N*m*s, range: [0, 0.3]}
+  C: {value: 760, unit: J/K, range: [200, 2500]}
+  G: {value: 7, unit: W/K, range: [1, 40]}
+nodes:
+  w: {unit: 1/s, storage: 1.9, initial: 0}
+  T: {unit: degC, storage: C, initial: 21}
+flows:
+  drive: {into: w, rate: torque, unit: N*m}
+  bearing: {from: w, rate: b * w, unit: N*m}
+  brake: {from: w, rate: mu * clamp * 0.12 * tanh(w / 2), unit: N*m}
+  heat: {into: T, rate: mu * clamp * 0.12 * tanh(w / 2) * w, unit: W}
+  loss: {from: T, rate: G * (T - 21), unit: W}
+outputs:
+  speed: {value: w, unit: 1/s, noise: 0.15}
+  disc: {value: T, unit: degC, noise: 1.0}
+"""
+
+
+def test_a_parameter_in_several_flows_may_depend_on_a_signal(tmp_path):
+    """A brake fades: its torque and its heat fell by laws of their own, each with a misfit."""
+    t, rng = np.arange(0.0, 300.0, 0.5), np.random.default_rng(5)
+    levels = {"torque": (0.0, 18.0, 24.0, 28.0), "clamp": (0.0, 500.0, 800.0, 1100.0)}
+    drives = {n: np.repeat(rng.choice(v, 20), 30) for n, v in levels.items()}
+
+    def mu(hot):
+        return 0.36 - 0.0007 * (hot - 21)
+
+    def rates(at, x):
+        torque, clamp = (drives[n][min(int(at / 0.5), len(t) - 1)] for n in levels)
+        brake = mu(x[1]) * clamp * 0.12 * np.tanh(x[0] / 2)
+        return (torque - brake - 0.035 * x[0]) / 1.9, (brake * x[0] - 9 * (x[1] - 21)) / 640
+
+    x = solve_ivp(rates, (0, t[-1]), [0.0, 21.0], t_eval=t, rtol=1e-8, atol=1e-8, max_step=0.25).y
+    noisy = x + rng.normal(size=x.shape) * np.array([[0.15], [1.0]])
+    table = Table("run", "", t, {**drives, "speed": noisy[0], "disc": noisy[1]})
+    d = diagnose(loads(BRAKE), [table], {}, limits())
+    entry = law_entry(d.laws, d.worth)
+    assert (entry["part"], entry["where"], entry["of"]) == ("parameter", "mu", ["T"])
+    assert law_sentence(entry).startswith("A law for it: a change of the parameter mu, ")
+    own = {q: p.value for q, p in d.final.plant.parameters.items()} | {"T": np.linspace(30, 200, 9)}
+    found = own["mu"] + ex.evaluate(law_rate(d.final, d.laws[0].placed), own)
+    assert found == pytest.approx(mu(own["T"]), rel=0.03)
+    with pytest.raises(InputError, match="mu of this plant alone"):
+        save_effect({"remainder": {"law": entry}}, "fading", tmp_path)
+
+
+TANK = """\
+format: thermoctl-plant/1
+title: Open tank with a heater
+inputs:
+  heater: {unit: W}
+  air: {unit: degC, role: ambient}
+parameters:
+  C_w: {value: 40000, unit: J/K, range: [10000, 100000]}
+  C_l: {value: 4300, unit: J/K, range: [1000, 20000]}
+  G_w: {value: 75, unit: W/K, range: [5, 400]}
+  G_a: {value: 9, unit: W/K, range: [1, 60]}
+nodes:
+  water: {unit: degC, storage: C_w, initial: 21, initial_sigma: 0.1}
+  wall: {unit: degC, storage: C_l, initial: 21, initial_sigma: 0.2}
+flows:
+  heat: {into: water, rate: heater, unit: W}
+  film: {from: water, into: wall, rate: G_w * (water - wall), unit: W}
+  loss: {from: wall, rate: G_a * (wall - air), unit: W}
+outputs:
+  T_water: {value: water, unit: degC, noise: 0.12}
+  T_wall: {value: wall, unit: degC, noise: 0.2}
+"""
+
+
+def test_a_law_takes_the_place_of_effects_that_it_makes_needless():
+    """Beside three effects no law was tried: a conductance that grows stood for water that evaporates."""
+    t, levels = (
+        np.arange(1300) * 15.0,
+        np.repeat([0.0, 2400, 900, 2800, 400, 0], [8, 300, 200, 270, 200, 322]),
+    )
+
+    def pressure(hot):
+        return 610.8 * np.exp(17.27 * hot / (hot + 237.3))
+
+    def rates(at, x):
+        film = 95 * (x[0] - x[1])
+        vapour = 0.014 * (pressure(x[0]) - 0.5 * pressure(21.0))
+        heat = levels[min(int(at / 30), len(t) - 1)]
+        return (heat - film - vapour) / 33000, (film - 7 * (x[1] - 21)) / 5200, (x[0] - x[2]) / 120
+
+    x = solve_ivp(rates, (0, t[-1]), [21.0] * 3, t_eval=t, rtol=1e-7, atol=1e-7, max_step=30).y
+    rng = np.random.default_rng(3)
+    read = {"T_water": x[2] + 0.12 * rng.normal(size=len(t)), "T_wall": x[1] + 0.2 * rng.normal(size=len(t))}
+    table = Table("run", "", t, {"heater": levels, "air": np.full(len(t), 21.0), **read})
+    imitate = ("temperature_dependent_conductance", "sensor_lag", "sensor_drift")
+    d = diagnose(loads(TANK), [table], {n: catalogue()[n] for n in imitate}, limits())
+    assert d.final.hypothesis.keys == {("sensor_lag", "T_water"), ("law", "water")}
+    assert d.law.proposal.place == Place("water")
+    lost = -ex.evaluate(law_rate(d.final, d.law.placed), _names_of(d, np.array([30.0, 60.0, 90.0])))
+    assert np.ptp(lost / (0.014 * (pressure(np.array([30.0, 60.0, 90.0])) - pressure(21.0) / 2))) < 0.2
+
+
+def _names_of(d, water):
+    own = {q: p.value for q, p in d.final.plant.parameters.items()}
+    return {**own, "water": water, "wall": water, "air": 21.0}
 
 
 def test_parameters_that_scale_together_absorb_no_flow():

@@ -13,14 +13,14 @@ import numpy as np
 from scipy.special import softmax
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
-from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, limit_of, refitted_law
+from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, laws_of, limit_of, refitted_law, settled
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (
     BEATEN,
@@ -109,6 +109,32 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
     if s.best is not before:
         grow(s)
         swap(s)
+        _fewer(s)
+
+
+def _fewer(s: Search) -> None:
+    """Refit the leading law without each of the effects beside it, until none may be left out."""
+    while laws := laws_of(s.best.fitted):
+        best = s.best
+        rest = [e for e in best.fitted.hypothesis.effects if not isinstance(e, PlacedLaw)]
+        for e in rest:
+            if best.fitted.hypothesis.keys - {e.key} in s.tried or s.case.budget.stopped():
+                continue
+            base = _beside(s, [o for o in rest if o is not e], best.fitted)
+            first, *others = (settled(law, best.fitted) for law in laws)
+            f = base and refitted_law(s.case, base.fitted, first, best.fitted, others)
+            if base and f and not f.absent and not f.doubtful and not at_bound(f):
+                s.keep([s.weighed(f)])
+        if s.best is best:
+            return
+
+
+def _beside(s: Search, effects: Sequence[Placed], values: Fitted) -> Weighed | None:
+    """Return a hypothesis of the catalogue, refitted from the values of another one if it is not known."""
+    keys = frozenset(e.key for e in effects)
+    if keys not in s.tried and (w := rebuilt(s, effects, values, values)):
+        s.keep([w])
+    return s.tried.get(keys)
 
 
 def _size(w: Weighed) -> int:
@@ -209,15 +235,13 @@ def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) ->
         return max(less, key=lambda w: w.score, default=None)
     if len(rest) == len(effects):
         return None
-    keys = frozenset(e.key for e in rest)
-    if keys not in s.tried and (w := rebuilt(s, rest, base.fitted, base.fitted)):
-        s.keep([w])
-    return s.tried.get(keys)
+    return _beside(s, rest, base.fitted)
 
 
 def _names(p: Proposal) -> set[str]:
-    """Return the names that a law's signals read."""
-    return {n for t in p.terms for s in t.signals for n in ex.names(s.value)}
+    """Return the names that a law's signals and shares read."""
+    read = [s.value for t in p.terms for s in t.signals] + [share for _, share in p.place.shares]
+    return {n for e in read for n in ex.names(e)}
 
 
 def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed | None:

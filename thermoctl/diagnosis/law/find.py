@@ -167,7 +167,7 @@ def refits(
             best = more_evidence - p.cost >= ahead
             ahead = max(ahead, more_evidence - p.cost)
             if more and (at_bound(f) or len(p.terms) > 1 and (f.doubtful or best)):
-                simpler = simpler_law(p, f) if len(p.terms) > 1 else limit_of(laws_of(f)[0], f)
+                simpler = (simpler_law if len(p.terms) > 1 else limit_of)(laws_of(f)[0], f)
                 if simpler.kind not in {q.kind for q in queue}:
                     queue.append(simpler)
                     more -= 1

@@ -263,8 +263,9 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
     else:
         for k, (_, share) in enumerate(place.shares, 1):
             changes.append({"flow": {"into": f"other{k}", "rate": str(ex.mul(of_plant(share), rate))}})
-        ends = {"into": "target", **({"from": "source"} if place.source else {})}
-        changes.append({"flow": {**ends, "rate": str(rate)}})
+        if place.part == "flow":
+            ends = {"into": "target", **({"from": "source"} if place.source else {})}
+            changes.append({"flow": {**ends, "rate": str(rate)}})
     return Effect(LAW, "A law that the recordings propose", "", (tuple(changes),), tuple(parameters))
 
 

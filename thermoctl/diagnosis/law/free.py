@@ -68,7 +68,7 @@ def choices(
 
     def explains(p: Place) -> bool:
         """Return whether a law at a place may explain something at the nodes."""
-        new = p.source and not p.flows and {*p.nodes} not in links
+        new = p.source and not p.of and {*p.nodes} not in links
         return {*p.nodes} <= {*nodes} if new else bool({*p.nodes} & {*nodes})
 
     return [(p, s) for p in where if explains(p) for s in signals(rig, p, linear.metric.signals)]

@@ -245,7 +245,7 @@ def _singles(
     sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
     tried = [f for f in families(first, every, duration, sample) if not new or _reads((f,), new)]
-    if place.part == "storage":
+    if place.part != "flow":
         tried = [f for f in tried if not f.form.memory]  # a capacity remembers nothing
     for part in chunks(tried, lambda f: f.count, CHUNK):
         of_families = zip(*(linear.along(f.values) for f in part), strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Mapping, Sequence
 
@@ -105,12 +106,20 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
     return values, ranges
 
 
+def settled(law: PlacedLaw, f: Fitted) -> Proposal:
+    """Return a refitted law at the values of the refit."""
+    p, terms, sizes = law.proposal, list[Term](), list[float]()
+    for k, t in enumerate(p.terms, 1):
+        values = {q: f.plant.parameters[law.own[f"{q}{k}"]].value for q in (*t.form.sizes, *t.form.shapes)}
+        terms.append(dataclasses.replace(t, shapes={q: values[q] for q in t.form.shapes}))
+        sizes += [values[q] for q in t.form.sizes]
+    return dataclasses.replace(p, terms=tuple(terms), sizes=tuple(sizes))
+
+
 def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
     """Return a refitted law of one term; of the form that it becomes, where a shape is at its upper bound."""
-    p, (term,) = law.proposal, law.proposal.terms
-    values = {q: f.plant.parameters[name].value for q, name in law.own.items()}
-    sizes = tuple(values[f"{q}1"] for q in term.form.sizes)
-    term = dataclasses.replace(term, shapes={q: values[f"{q}1"] for q in term.form.shapes})
+    p = settled(law, f)
+    (term,), sizes = p.terms, p.sizes
     high = any(f.fit.at_bound.get(law.own[f"{q}1"]) == "high" for q in term.form.shapes)
     if term.form.limit and high:
         term, sizes = _likest(term, sizes, next(x for x in library() if x.name == term.form.limit))
@@ -134,25 +143,18 @@ def _likest(term: Term, sizes: Sequence[float], form: Form) -> tuple[Term, tuple
     return dataclasses.replace(term, form=form, shapes=shapes), (size,)
 
 
-def simpler_law(p: Proposal, f: Fitted) -> Proposal:
+def simpler_law(law: PlacedLaw, f: Fitted) -> Proposal:
     """Return a refitted law without its least significant term, at the values of the refit."""
-    c, values = f.hypothesis.effects[-1].candidate, f.plant.parameters
-
-    def value(q: str) -> float:
-        """Return the fitted value of a parameter of the law."""
-        return values[c.own(q)].value
-
-    sizes = [[value(f"{q}{k}") for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
-    significant = [
-        max(abs(value(f"{q}{k}")) / max(f.sd.get(c.own(f"{q}{k}"), 0.0), 1e-300) for q in t.form.sizes)
-        for k, t in enumerate(p.terms, 1)
+    p = settled(law, f)
+    named = [[law.own[f"{q}{k}"] for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
+    sizes = np.split(np.array(p.sizes), np.cumsum([len(own) for own in named])[:-1])
+    sure = [
+        max(abs(size) / max(f.sd.get(n, 0.0), 1e-300) for size, n in zip(values, own, strict=True))
+        for values, own in zip(sizes, named, strict=True)
     ]
-    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(significant))]
-    terms = tuple(
-        dataclasses.replace(p.terms[k], shapes={q: value(f"{q}{k + 1}") for q in p.terms[k].form.shapes})
-        for k in kept
-    )
-    return dataclasses.replace(p, terms=terms, sizes=tuple(v for k in kept for v in sizes[k]))
+    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(sure))]
+    left = tuple(float(v) for k in kept for v in sizes[k])
+    return dataclasses.replace(p, terms=tuple(p.terms[k] for k in kept), sizes=left)
 
 
 def affordable(case: Case, parent: Fitted) -> int:
@@ -165,9 +167,13 @@ def affordable(case: Case, parent: Fitted) -> int:
 
 def law_rate(f: Fitted, law: PlacedLaw) -> ex.Expr:
     """Return the expression of the flow or storage that contains a law of a hypothesis."""
-    own, nodes = set(law.own.values()), law.candidate.place.nodes
-    if "storage" in law.candidate.effect.changes[0][-1]:
-        return f.plant.nodes[nodes["target"]].storage
+    own, place = set(law.own.values()), law.proposal.place
+    if place.part == "storage":
+        return f.plant.nodes[place.target].storage
+    if place.part == "parameter":
+        terms = [t.expression(k) for k, t in enumerate(law.proposal.terms, 1)]
+        names = {short: name(long) for short, long in law.candidate.own_in(f.plant).items()}
+        return ex.fill(functools.reduce(ex.add, terms), names)
     return next(x.rate for x in reversed(list(f.plant.flows.values())) if ex.names(x.rate) & own)
 
 

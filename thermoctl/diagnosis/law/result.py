@@ -57,7 +57,7 @@ def law_entry(laws: Sequence[FoundLaw], worth: Worth) -> dict[str, Any] | None:
         "share_closed": worth.share_closed,
         "held_out": worth.reserved,
         "equivalent": family(law),
-        "effect": None if place.flows else effect_file(law),
+        "effect": None if place.of else effect_file(law),
         "beside": [law_entry([other], worth) for other in others],
     }
 
@@ -265,7 +265,7 @@ def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> list[Pat
     for law in laws:
         if not law["effect"]:
             raise InputError(
-                f"the law acts in the flows {law['where']} of this plant alone; a law in one flow or storage was expected"
+                f"the law acts at {law['where']} of this plant alone; a law in one flow or storage was expected"
             )
     make_folder(folder)
     names = [label, *(f"{label}_{k}" for k in range(2, len(laws) + 1))]

@@ -11,7 +11,7 @@ from thermoctl.diagnosis.hypothesis.places import exchanging, storing
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE, Rig, zero_of
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
-from thermoctl.plant.language import Plant
+from thermoctl.plant.language import Flow, Plant
 from thermoctl.units import conversion, dimension
 
 BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
@@ -30,22 +30,23 @@ class Place:
 
     - flow: into the node `target` from outside, or from the node `source`
     - storage: of the node `target`
-    - conversion: several flows of the plant file that are always in proportion, `flows`. For each unit into
-      the target a share, an expression of parameters, goes into other nodes: `shares`"""
+    - conversion: several flows of the plant file that are always in proportion, `of`. For each unit into
+      the target a share, an expression of parameters, goes into other nodes: `shares`
+    - parameter: one in several flows, `of`. It changes each of the nodes by its share for each unit"""
 
     target: str
     source: str | None = None
     part: str = "flow"
-    flows: tuple[str, ...] = ()
+    of: tuple[str, ...] = ()
     shares: tuple[tuple[str, Expr], ...] = ()
 
     @property
     def where(self) -> str:
         """Return its name in a result."""
-        if self.part != "flow":
-            return f"{self.part} of {self.target}"
-        if self.flows:
-            return " and ".join(self.flows)
+        if self.part == "storage":
+            return f"storage of {self.target}"
+        if self.of:
+            return " and ".join(self.of)
         return f"{self.source}-{self.target}" if self.source else self.target
 
     @property
@@ -56,6 +57,8 @@ class Place:
     @property
     def ends(self) -> tuple[tuple[str, Expr], ...]:
         """Return the nodes that it changes, the target first, each with its share of the flow."""
+        if self.part == "parameter":
+            return self.shares
         source = ((self.source, num(-1.0)),) if self.source else ()
         return ((self.target, ex.ONE), *source, *self.shares)
 
@@ -93,7 +96,36 @@ def places(rig: Rig) -> list[Place]:
     nodes = storing(rig)
     stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
     joined = conversions(rig.physics, nodes)
-    return [*map(Place, nodes), *(Place(b, a) for a, b in exchanging(rig)), *stored, *joined]
+    flows = [*map(Place, nodes), *(Place(b, a) for a, b in exchanging(rig))]
+    return [*flows, *stored, *joined, *shared(rig.physics, nodes, joined)]
+
+
+def shared(plant: Plant, nodes: Sequence[str], joined: Sequence[Place]) -> list[Place]:
+    """Return the free parameters in several flows, each of which it changes in proportion, as places.
+
+    A brake's friction slows the wheel and heats the disc: if it depends on the temperature, both change.
+    `joined`: conversions; a parameter of one of them is none."""
+    fixed = {*(n.storage for n in plant.nodes.values()), *(o.value for o in plant.outputs.values())}
+    out = list[Place]()
+    for q in (q for q, p in plant.parameters.items() if p.range):
+        flows = [f for f in plant.flows.values() if q in ex.names(f.rate)]
+        known = len(flows) < 2 or any({f.name for f in flows} <= {*p.of} for p in joined)
+        if known or any(q in ex.names(e) for e in fixed) or any(map(_is_closed, flows)):
+            continue
+        shares = dict[str, Expr]()
+        for f in flows:
+            slope = ex.derivative(f.rate, q)
+            for n, share in ((f.source, ex.neg(slope)), (f.target, slope)):
+                if n:
+                    shares[n] = ex.add(shares.get(n, ex.ZERO), share)
+        if shares.keys() <= {*nodes} and not any(q in ex.names(e) for e in shares.values()):
+            out.append(Place(next(iter(shares)), None, "parameter", (q,), tuple(shares.items())))
+    return out
+
+
+def _is_closed(f: Flow) -> bool:
+    """Return whether the slope of a flow by a parameter is unknown: an FMU's, or that of a delay."""
+    return ex.calls_fmu(f.rate) or any(e.op == "delay" for e in ex.walk(f.rate))
 
 
 def conversions(plant: Plant, nodes: Sequence[str]) -> list[Place]:

@@ -335,6 +335,8 @@ def missing_flow(case: Case, f: Fitted, node: str) -> float | None:
 
 def law_unit(plant: Plant, place: Place) -> str | None:
     """Return the unit of a law at a place, None where the plant states none."""
+    if place.part == "parameter":
+        return plant.parameters[place.of[0]].unit
     flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
     if place.part == "flow" or not flow or not own:
         return flow if place.part == "flow" else None

@@ -125,9 +125,11 @@ def law_sentence(entry: Result, head: str = "A law for it") -> str:
     values += "".join(f"; {m} is {text}" for m, text in entry.get("memory", {}).items())
     ends = f"from {entry['from']} into {entry['into']}" if entry["from"] else f"into {entry['into']}"
     ends += "".join(f", {share} times it into {node}" for node, share in entry.get("shares", {}).items())
-    acts = (
-        f"a flow {ends}" if entry.get("part", "flow") == "flow" else f"a {entry['part']} of {entry['into']}"
-    )
+    acts = {
+        "flow": f"a flow {ends}",
+        "storage": f"a storage of {entry['into']}",
+        "parameter": f"a change of the parameter {entry['where']}",
+    }[entry.get("part", "flow")]
     chances = f"probability {chance(entry['probability'])}"
     short = f", that is {entry['plain']}" if entry.get("plain") else ""
     return f"{head}: {acts}, {entry['expression']}, with {values}{short} ({chances})."
