@@ -16,10 +16,11 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
+from thermoctl.diagnosis.hypothesis.candidates import Keys
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
-from thermoctl.diagnosis.law.propose import TERMS, Proposal, propose_laws, propose_pairs
+from thermoctl.diagnosis.law.propose import TERMS, Proposal, more_terms, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, laws_of, limit_of, refitted_law, settled
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (
@@ -113,20 +114,45 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
 
 
 def _fewer(s: Search) -> None:
-    """Refit the leading law without each of the effects beside it, until none may be left out."""
+    """Leave out each effect beside the leading law in turn, and refit, until it leads no more without one.
+
+    An effect must not explain what one more term of the law does: so that is refitted, too."""
+    known = set[Keys]()
     while laws := laws_of(s.best.fitted):
         best = s.best
-        rest = [e for e in best.fitted.hypothesis.effects if not isinstance(e, PlacedLaw)]
-        for e in rest:
-            if best.fitted.hypothesis.keys - {e.key} in s.tried or s.case.budget.stopped():
+        effects = [e for e in best.fitted.hypothesis.effects if not isinstance(e, PlacedLaw)]
+        for e in effects:
+            keys = best.fitted.hypothesis.keys - {e.key}
+            base = _beside(s, [o for o in effects if o is not e], best.fitted)
+            if base is None or keys in known or s.case.budget.stopped():
                 continue
-            base = _beside(s, [o for o in rest if o is not e], best.fitted)
-            first, *others = (settled(law, best.fitted) for law in laws)
-            f = base and refitted_law(s.case, base.fitted, first, best.fitted, others)
-            if base and f and not f.absent and not f.doubtful and not at_bound(f):
-                s.keep([s.weighed(f)])
+            known.add(keys)
+            if keys not in s.tried:
+                _keep_laws(s, base, [settled(law, best.fitted) for law in laws])
+            if keys in s.tried:
+                _more(s, base, s.tried[keys].fitted)
         if s.best is best:
             return
+
+
+def _more(s: Search, base: Weighed, f: Fitted) -> None:
+    """Refit a hypothesis with one more term in each of its laws in turn; `base`: it without laws."""
+    laws = [settled(law, f) for law in laws_of(f)]
+    for k, law in enumerate(laws):
+        others = [*laws[:k], *laws[k + 1 :]]
+        try:
+            more = more_terms(s.case, f, law, s.limits) if len(law.terms) < TERMS else []
+        except (SimulationError, np.linalg.LinAlgError):
+            more = []
+        for p in more:
+            _keep_laws(s, base, [p, *others])
+
+
+def _keep_laws(s: Search, base: Weighed, laws: Sequence[Proposal]) -> None:
+    """Refit a hypothesis with laws, and keep it if all of it is significant."""
+    f = refitted_law(s.case, base.fitted, laws[0], base.fitted, laws[1:])
+    if f and not f.absent and not f.doubtful and not at_bound(f):
+        s.keep([s.weighed(f)])
 
 
 def _beside(s: Search, effects: Sequence[Placed], values: Fitted) -> Weighed | None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.free import (
@@ -36,6 +36,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, rates, signals
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import chunks
+from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -56,6 +57,7 @@ CHUNK = 256  # number of terms whose responses are computed at a time
 NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
 # Number of terms of each law of a pair; number of pairs, and of those that hold the same law.
 EACH, COUPLES, SHARED = 8, 6, 2
+ADDED = 4  # number of terms of a law's own signals that are added to it
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
 
 
@@ -135,6 +137,25 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
         kinds.append(_mixed([p for p in out if not new or _reads(p.terms, new)]))
     kinds.sort(key=lambda ps: -max((p.score for p in ps), default=-np.inf))
     return [p for ps in itertools.zip_longest(*kinds) for p in ps if p]
+
+
+def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list[Proposal]:
+    """Return a refitted law with one more term of its own signals, best first. Raises SimulationError.
+
+    `law`: at its refitted values. A law of the library is rarely exact: an effect of the catalogue must not
+    explain what another form of the law does."""
+    metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
+    linear = Tracked(metric, metric.residual, {})
+    own = list(dict.fromkeys(s for t in law.terms for s in t.signals))
+    out = []
+    for term in _varied(_best_first(_singles(linear, law.place, own, own, frozenset()))):
+        gain, sizes = predicted(linear, term.columns)
+        promise = gain - cost_of(linear, len(sizes) + len(term.term.form.shapes))
+        terms = (*law.terms, term.term)
+        out.append(
+            dataclasses.replace(law, terms=terms, sizes=(*law.sizes, *map(float, sizes)), promise=promise)
+        )
+    return sorted(out, key=lambda p: -p.score)[:ADDED]
 
 
 def _in_turn(
