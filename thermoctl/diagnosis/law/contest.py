@@ -213,8 +213,8 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
     """Return a hypothesis with the best law at each place, beside a parent and beside parts of it.
 
     Only laws that may reach the goal are refitted.
-    The effects of the parent may imitate the law that is proposed beside them: so it is refitted without
-    them, too, and without those that it makes insignificant. There its promise is larger by what they gain."""
+    The effects of the parent may imitate the law that is proposed beside them. So it is refitted without
+    them, too, and without those that it makes insignificant. There its promise is larger by their gain."""
     case, alone = s.case, s.tried[frozenset()]
     try:
         proposals = propose_laws(case, parent.fitted, s.limits)
@@ -225,7 +225,7 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
     proposals = [p for p in proposals if p.place.where not in taken]
 
     def refitted(base: Weighed) -> list[tuple[Proposal, Weighed]]:
-        """Return the laws that were refitted beside a hypothesis; beside a part of the parent, single ones."""
+        """Return the laws that were refitted beside a hypothesis; single ones beside a part of the parent."""
         more, plant = parent.score - base.score, base.fitted.plant
         known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
         some = [
