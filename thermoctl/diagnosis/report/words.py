@@ -130,7 +130,7 @@ def law_sentence(entry: Result, head: str = "A law for it") -> str:
         "storage": f"a storage of {entry['into']}",
         "parameter": f"a change of the parameter {entry['where']}",
     }[entry.get("part", "flow")]
-    chances = f"probability {chance(entry['probability'])}"
+    chances = f"that a law acts there has probability {chance(entry['probability'])}; this form fits best"
     short = f", that is {entry['plain']}" if entry.get("plain") else ""
     return f"{head}: {acts}, {entry['expression']}, with {values}{short} ({chances})."
 
