@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from thermoctl.checks.hung import without_hung
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
@@ -82,12 +83,14 @@ def sought(
 ) -> Sought:
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
-    (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in split(tables, held_out))
+    given, hung = without_hung(plant, [*tables, *held_out])
+    both = split(given[: len(tables)], given[len(tables) :])
+    (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in both)
     plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
-    known.notes.extend(notes)
+    known.notes.extend([*hung, *notes])
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
 
