@@ -191,7 +191,8 @@ def _chosen(
         fits = {keys: w.fitted for keys, w in tried.items()}
         misfit = late or max(over_noise(known, best)) > numbers.clean
         found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve, misfit), numbers.name)
-        if found[0] == chosen or not quiet:
+        against = min(found[2].values(), default=1.0) <= 1 - numbers.name
+        if found[0] == chosen or not quiet or against:
             return found
     # a recording set aside may know too little to confirm them; unconfirmed evidence counts less
     posterior = weigh(scores, physics, numbers.unasked)
