@@ -26,6 +26,7 @@ from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
+from thermoctl.diagnosis.verdict.coloured import coloured
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, timed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
@@ -126,7 +127,10 @@ def decided(sought: Sought) -> Diagnosis:
     # data that took part in the choice cannot speak against it
     checked = bool(chosen) and value.reserved
     remains = remainder(known, tried[chosen].fitted)
-    unknown = Missing()
+    unknown, sensors = Missing(), list[str]()
+    if remains >= numbers.name and not (chosen or asked):
+        sensors = coloured(known, null, numbers)
+        known = replace(known, notes=[*known.notes, *sensors])
     if remains < numbers.name:
         unknown = flow_missing(known, tried[chosen].fitted, reach.nodes, numbers)
     if unknown.probability >= numbers.name:
@@ -136,10 +140,10 @@ def decided(sought: Sought) -> Diagnosis:
         something=posterior.something,
         known=posterior.something if chosen or not asked else 0.0,
         named=named,
-        over_noise=max(after.over_noise.values()),
+        over_noise=1.0 if sensors else max(after.over_noise.values()),
         worth=_ratio(value.after, value.refit_only) if checked else 1.0,
         apart=max((rms / value.noise[o] for o, rms in value.after.items()), default=0.0) if checked else 0.0,
-        remains=remains,
+        remains=0.0 if sensors else remains,
         worse=value.worse if checked else 0.0,
         flow=unknown.probability,
     )
