@@ -16,7 +16,9 @@ from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.evidence.held_out import worse, worth
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.verdict.confirm import Confirm
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -134,3 +136,21 @@ def test_wild_readings_in_a_recording_set_aside_are_left_out_there_too():
     assert found.worth.refit_only["T"] < 1.3 * found.worth.noise["T"]
     assert [name for name, *_ in found.case.outliers] == ["r0", "r1", "r2"]
     assert any("T in r2 at 385" in note for note in found.case.notes)
+
+
+@pytest.mark.parametrize(("confirmed", "verdict"), [(0.02, "unexplained"), (0.4, "explained")])
+def test_beside_noise_alone_recordings_set_aside_may_know_little_but_not_speak_against(
+    monkeypatch, confirmed, verdict
+):
+    """A heat source with which they were predicted worse, with 0.973, was named and 'confirmed' with 1."""
+    plant, tables = loads(WIDE_BLOCK), []
+    sun = "  sun: {into: one, rate: 0.6 * (step(t - 900) - step(t - 1300)), unit: W}\noutputs:"
+    for k in range(3):
+        t, rng = np.arange(0.0, 2400.0, 4.0), np.random.default_rng(k)
+        real = loads(WIDE_BLOCK.replace("outputs:", sun)) if k == 0 else plant
+        columns = {"heat": np.repeat(rng.uniform(0, 20, 8), 75), "air": 22 + 0 * t}
+        tables.append(compile_plant(real).measure(Table(f"r{k}", "", t, columns), k))
+    monkeypatch.setattr(Confirm, "probability", lambda self, home, key: confirmed)
+    found = diagnose(plant, tables, catalogue(), limits())
+    assert found.decision.verdict == verdict
+    assert bool(found.shown) == (verdict == "explained")

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from thermoctl.checks.data import data_findings
 from thermoctl.checks.file import unconverted
 from thermoctl.checks.finding import Finding
+from thermoctl.checks.hung import hung_findings, without_hung
 from thermoctl.checks.labels import label_findings
 from thermoctl.checks.model import plant_findings, start_findings
 from thermoctl.files.yamlfile import InputError
@@ -28,11 +29,13 @@ def checks(plant: Plant, recordings: Sequence[Table]) -> list[Finding]:
 
     Raises InputError where a recording lacks an input of the plant, or all its outputs."""
     model = compile_plant(plant)
-    tables = [in_plant_units(plant, t) for t in recordings]
+    given = [in_plant_units(plant, t) for t in recordings]
+    tables, _ = without_hung(plant, given)
     excitations = [model.excitation(t) for t in tables]
     if text := next(filter(None, (outputs_lacking(plant, t) for t in tables)), ""):
         raise InputError(text)
     findings = [*plant_findings(model, excitations), *(f for f, _ in unconverted(plant))]
+    findings += [f for t in given for f in hung_findings(plant, t)]
     for table, excitation in zip(tables, excitations, strict=True):
         findings += data_findings(model, table, excitation)
     if not any(f.severe for f in findings):

@@ -10,6 +10,7 @@ from typing import TextIO
 
 from thermoctl.checks import Finding, checks
 from thermoctl.checks.file import file_findings
+from thermoctl.checks.hung import without_hung
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, commands, load
 from thermoctl.plant.lacking import outputs_lacking
@@ -67,7 +68,7 @@ def refit(args: argparse.Namespace) -> int:
                 f"{plant.file}: not refitted: the checks above would make any number doubtful; correct the data or the "
                 "plant, or refit with --anyway"
             )
-        return tables
+        return without_hung(plant, tables)[0]
 
     return commands.refit(args, read)
 

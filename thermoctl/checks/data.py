@@ -12,6 +12,7 @@ from math import gcd, log
 import numpy as np
 
 from thermoctl.checks.finding import Finding
+from thermoctl.checks.hung import ALARM, FEW, quantum
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
@@ -21,9 +22,7 @@ from thermoctl.plant.language import Input
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
-ALARM = 1e-6  # probability of a false alarm for each column and recording
 SIGMAS = 6.0
-FEW = 8  # with fewer samples nothing is checked
 FREE = 12  # iterations of the refit that tests whether the plant moves like this without its inputs
 JOINED = 0.45  # largest other step of a counter that overflows, over its period: from 0.5 on nothing joins it
 TURNS = 0.7  # share of overflows with motion on both sides; at the others it turns round or stands
@@ -115,22 +114,17 @@ def _between(model: Model, table: Table, excitation: Excitation, held: np.ndarra
     return [Finding("between", table.path, what, advice, severe=False)]
 
 
-def _quantum(values: np.ndarray) -> float:
-    """Return the step of the readings: the least difference of any two values. Of rows, it may be a slope."""
-    return float(np.diff(np.unique(values)).min(initial=np.inf))
-
-
 def _resampled(table: Table, column: str, values: np.ndarray) -> list[Finding]:
     """Find readings that change at every k-th sample only, or on straight lines between them.
 
     Straight lines between readings are severe: no sensor makes them. Changes at free instants are all
     multiples of k apart with probability k^(1 - changes)."""
-    quantum = _quantum(values)
-    if not np.isfinite(quantum):
+    step = quantum(values)
+    if not np.isfinite(step):
         return []
-    for difference, tolerance, how in ((1, 0.0, "held"), (2, 2.001 * quantum, "interpolated")):
+    for difference, tolerance, how in ((1, 0.0, "held"), (2, 2.001 * step, "interpolated")):
         jumps = np.flatnonzero(np.abs(np.diff(values, difference)) > tolerance)
-        if len(jumps) < FEW or (difference == 2 and np.ptp(values) < 100 * quantum):
+        if len(jumps) < FEW or (difference == 2 and np.ptp(values) < 100 * step):
             continue
         every = gcd(*np.diff(jumps).tolist())
         if every > 1 and (len(jumps) - 1) * log(every) > -log(ALARM):
@@ -148,7 +142,7 @@ def _copies(table: Table, column: str, values: np.ndarray, t: np.ndarray) -> lis
 
     Two independent second differences of noise agree with the probability of their commonest value. Smooth
     or coarse readings repeat by themselves and are left out."""
-    second = np.round(np.diff(values, 2) / max(_quantum(values), 1e-300))
+    second = np.round(np.diff(values, 2) / max(quantum(values), 1e-300))
     if not np.isfinite(second).all() or len(second) < FEW:
         return []
     _, counts = np.unique(second, return_counts=True)
@@ -265,7 +259,7 @@ def _wrapped(
         return []
     if period < np.ptp(y) - error:
         return []
-    bits = _quantum(y) * 2.0 ** round(log(period / _quantum(y), 2))
+    bits = quantum(y) * 2.0 ** round(log(period / quantum(y), 2))
     turn = {"deg": 360.0, "rad": 2 * np.pi}.get(unit, np.inf)
     both = leaps.min() < 0 < leaps.max()
     sure = [size for size in (bits, turn) if abs(period - size) <= min(error, 0.01 * size)]
@@ -299,7 +293,7 @@ def _stuck(
     same = max((len(y) - 1 - len(edges) - length) / rest, 1 / (len(y) + 1))
     # Two readings of a body at rest agree with probability q / (2 sqrt(pi) sd), q the step of the readings.
     resting = 1.4826 * float(np.median(np.abs(np.diff(y, 2)))) / 6**0.5
-    same = max(same, _quantum(y) / (2 * np.pi**0.5 * max(min(sd, resting), 1e-300)))
+    same = max(same, quantum(y) / (2 * np.pi**0.5 * max(min(sd, resting), 1e-300)))
     if same > 0.5 or length < FEW or y[a] in (y.min(), y.max()):
         return []
     if length * -log(same) < log(len(y) / ALARM) or np.ptp(simulated[a : b + 1]) < 2 * SIGMAS * sd:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from thermoctl.checks.hung import without_hung
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
@@ -25,6 +26,7 @@ from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
+from thermoctl.diagnosis.verdict.coloured import coloured
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, timed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
@@ -82,12 +84,14 @@ def sought(
 ) -> Sought:
     """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
     say("refitting the plant's own parameters")
-    (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in split(tables, held_out))
+    given, hung = without_hung(plant, [*tables, *held_out])
+    both = split(given[: len(tables)], given[len(tables) :])
+    (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in both)
     plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
-    known.notes.extend(notes)
+    known.notes.extend([*hung, *notes])
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
 
@@ -123,7 +127,10 @@ def decided(sought: Sought) -> Diagnosis:
     # data that took part in the choice cannot speak against it
     checked = bool(chosen) and value.reserved
     remains = remainder(known, tried[chosen].fitted)
-    unknown = Missing()
+    unknown, sensors = Missing(), list[str]()
+    if remains >= numbers.name and not (chosen or asked):
+        sensors = coloured(known, null, numbers)
+        known = replace(known, notes=[*known.notes, *sensors])
     if remains < numbers.name:
         unknown = flow_missing(known, tried[chosen].fitted, reach.nodes, numbers)
     if unknown.probability >= numbers.name:
@@ -133,10 +140,10 @@ def decided(sought: Sought) -> Diagnosis:
         something=posterior.something,
         known=posterior.something if chosen or not asked else 0.0,
         named=named,
-        over_noise=max(after.over_noise.values()),
+        over_noise=1.0 if sensors else max(after.over_noise.values()),
         worth=_ratio(value.after, value.refit_only) if checked else 1.0,
         apart=max((rms / value.noise[o] for o, rms in value.after.items()), default=0.0) if checked else 0.0,
-        remains=remains,
+        remains=0.0 if sensors else remains,
         worse=value.worse if checked else 0.0,
         flow=unknown.probability,
     )
@@ -188,7 +195,8 @@ def _chosen(
         fits = {keys: w.fitted for keys, w in tried.items()}
         misfit = late or max(over_noise(known, best)) > numbers.clean
         found = confirmed(posterior, chosen, Confirm(known, fits, sought.reserve, misfit), numbers.name)
-        if found[0] == chosen or not quiet:
+        against = min(found[2].values(), default=1.0) <= 1 - numbers.name
+        if found[0] == chosen or not quiet or against:
             return found
     # a recording set aside may know too little to confirm them; unconfirmed evidence counts less
     posterior = weigh(scores, physics, numbers.unasked)

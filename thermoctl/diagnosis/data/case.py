@@ -33,6 +33,7 @@ STATED = 12  # least number if the plant file states the output's noise, so that
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
+NORMAL = 2.04  # standard deviation of white noise over its median distance from medians of five values
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
 LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
@@ -321,9 +322,9 @@ def without_outliers(
             if len(index) < LEAST:
                 continue
             away = e[index, j] - _median_of_five(e[index, j])
-            limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
+            limit = OUTLIER * max(NORMAL * float(np.median(np.abs(away))), noise[j].sigma)
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
-            far = (np.abs(away) > limit) & ~predicted
+            far = (np.abs(away) > limit) & (_from_neighbours(e[index, j]) > limit) & ~predicted
             lasts = ~_lonely(e[index, j])
             lasts[:-1] &= switched  # nothing but a switch is answered so quickly
             odd = index[far & ~lasts]
@@ -344,6 +345,16 @@ def _lonely(e: np.ndarray) -> np.ndarray:
     before[0], after[-1] = e[2], 3 * e[-2] - 2 * e[-3]
     away = np.minimum(np.abs(e - before), np.abs(e - after))
     return np.asarray(np.abs(before - after) < away)
+
+
+def _from_neighbours(e: np.ndarray) -> np.ndarray:
+    """Return how far each value is from the cubic through two neighbours on either side.
+
+    The crest of a fast swing is far from the median of its neighbours, but not from such a curve. One of two
+    wild values in a row is far from the curve that leaves out the other: the larger distance counts."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(e, 3, mode="symmetric"), 7)
+    ahead = np.array([0.0, -0.3, 1.0, -1.0, 0.0, 0.5, -0.2])  # without the next value
+    return np.asarray(np.maximum(np.abs(around @ ahead), np.abs(around @ ahead[::-1])))
 
 
 def _median_of_five(e: np.ndarray) -> np.ndarray:
