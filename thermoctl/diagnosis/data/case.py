@@ -33,7 +33,6 @@ STATED = 12  # least number if the plant file states the output's noise, so that
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
-NORMAL = 2.04  # standard deviation of white noise over its median distance from medians of five values
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
 LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
@@ -322,7 +321,7 @@ def without_outliers(
             if len(index) < LEAST:
                 continue
             away = e[index, j] - _median_of_five(e[index, j])
-            limit = OUTLIER * max(NORMAL * float(np.median(np.abs(away))), noise[j].sigma)
+            limit = OUTLIER * max(1.4826 * float(np.median(np.abs(away))), noise[j].sigma)
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
             far = (np.abs(away) > limit) & (_from_neighbours(e[index, j]) > limit) & ~predicted
             lasts = ~_lonely(e[index, j])

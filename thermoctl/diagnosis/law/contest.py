@@ -108,6 +108,9 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
         if w is _leading(s, _size(w)):
             s.extended(w)
     if s.best is not before:
+        # the search may have spent its refits before it met the law
+        budget = s.case.budget
+        budget.fits = max(budget.fits, budget.fits_done + s.limits.beam * s.limits.shortlist)
         grow(s)
         swap(s)
         _fewer(s)

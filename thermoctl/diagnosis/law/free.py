@@ -18,6 +18,7 @@ from thermoctl.diagnosis.law.signals import Place, Signal, places, signals
 from thermoctl.diagnosis.law.smooth import Tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.metric import Metric, Plain
+from thermoctl.plant import expression as ex
 
 PIECES = 8  # number of knots of a free function of a signal
 NODES = 4  # number of nodes, those where a free flow in time explains most, at which laws are proposed
@@ -37,7 +38,7 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     linear = Tracked(metric, metric.residual, {})
     rig = case.rig(f.rough_plant, metric.drives)
     where = places_in(case, rig)
-    combos = choices(rig, where, entered(case, f, where, NODES), linear)
+    combos = choices(case, rig, where, entered(case, f, where, NODES), linear)
     moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
     both = [(p, v, w) for p, v in moving for q, w in combos if q == p and w != v]
     products = [(p, partial(_along_both, linear, a, b)) for p, v, w in both for a, b in ((v, w), (w, v))]
@@ -59,19 +60,24 @@ def entered(case: Case, f: Fitted, where: Sequence[Place], most: int) -> list[st
 
 
 def choices(
-    rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
+    case: Case, rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
 ) -> list[tuple[Place, Signal]]:
     """Return the places at some nodes, each with every signal that a law there may depend on.
 
-    A flow between nodes that the plant file does not link has to explain something at both."""
-    links = [{f.source, f.target} for f in rig.physics.flows.values()]
+    A flow between nodes that the plant file does not link has to explain something at both. A node that an
+    effect added is no signal if nothing but a reading depends on it: what a slow gauge shows opens no valve."""
+    flows = rig.physics.flows.values()
+    links = [{f.source, f.target} for f in flows]
+    acting = {n for f in flows if {f.source, f.target} & case.plant.nodes.keys() for n in ex.names(f.rate)}
+    shown = rig.physics.nodes.keys() - case.plant.nodes.keys() - acting
 
     def explains(p: Place) -> bool:
         """Return whether a law at a place may explain something at the nodes."""
         new = p.source and not p.of and {*p.nodes} not in links
         return {*p.nodes} <= {*nodes} if new else bool({*p.nodes} & {*nodes})
 
-    return [(p, s) for p in where if explains(p) for s in signals(rig, p, linear.metric.signals)]
+    found = [(p, s) for p in where if explains(p) for s in signals(rig, p, linear.metric.signals)]
+    return [(p, s) for p, s in found if not ex.names(s.value) & shown]
 
 
 def log_number(combos: Sequence[tuple[Place, Signal]]) -> float:

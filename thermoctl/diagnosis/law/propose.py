@@ -32,7 +32,7 @@ from thermoctl.diagnosis.law.free import (
     ranked,
     unlikely,
 )
-from thermoctl.diagnosis.law.signals import Place, Signal, rates, signals
+from thermoctl.diagnosis.law.signals import Place, Signal, rates
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import chunks
@@ -126,7 +126,7 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
 
     Laws of unread columns take no turn from the others: the best of both kinds come one by one."""
     rig, where, linear = linearised(case, parent)
-    combos = choices(rig, where, linear.likely[:NODES], linear)
+    combos = choices(case, rig, where, linear.likely[:NODES], linear)
     base, pool, kinds = (log_number(combos), limits), list[Found](), list[list[Proposal]]()
     for part, new in _in_turn(rig, combos):
         pool = _best_first([*pool, *_terms(rig, linear, ranked(linear, part), COMBINATIONS, new)])
@@ -210,9 +210,7 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
     best = max(couples, key=lambda c: couples[c][0], default=None)
     if best is None or couples[best][0] < alone + NEEDED:
         return []
-    combos = [
-        (p, s) for n in best if (p := Place(n)) in where for s in signals(rig, p, linear.metric.signals)
-    ]
+    combos = choices(case, rig, [p for p in where if p in map(Place, best)], best, linear)
     base, out = (log_number(combos), limits), list[tuple[Proposal, Proposal]]()
     for part, new in _in_turn(rig, combos):
         each = []
