@@ -177,16 +177,25 @@ def ratio(given: str, wanted: str) -> Fraction | None:
 
 
 def size_of(unit: str) -> float | None:
-    """Return the size of a unit of common symbols in SI units, a degree as a kelvin; None for any other."""
+    """Return the size of a unit in SI units, a degree as a kelvin; None where it has an offset or no size."""
     if not _COMMON_UNIT.fullmatch(unit):
-        return None
+        return _size_by_pint(unit)
     size = 1.0
     for sign, symbol, power in _COMMON_PART.findall(unit):
         one = 1.0 if symbol == "degC" else float(SYMBOLS.get(symbol, ("", 0))[1])
         if not one:
-            return None
+            return _size_by_pint(unit)
         size *= one ** (float(power or 1) * (-1 if sign == "/" else 1))
     return size
+
+
+def _size_by_pint(unit: str) -> float | None:
+    registry = _registry()
+    try:
+        ends = [registry.Quantity(x, _spelled(unit)).to_base_units().magnitude for x in (0.0, 1.0)]
+    except _pint()[1]:
+        return None
+    return float(ends[1]) if ends[0] == 0 else None
 
 
 def _spelled(unit: str) -> str:

@@ -10,6 +10,7 @@ import pytest
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
 from thermoctl.checks.commands import report
+from thermoctl.checks.file import file_findings
 from thermoctl.cli import main
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -242,6 +243,34 @@ def test_watts_that_are_kilowatts_beside_missing_physics(power):
     found = checks(loads(PLANTS[TWO].replace("heat: {unit: W}", "heat: {unit: kW}")), [table])
     assert [f.kind for f in found if f.severe] == ["unit"]
     assert "nothing converts it" in found[0].what
+
+
+FLIES = """\
+format: thermoctl-plant/1
+title: Flies in a bottle
+inputs: {fed: {unit: 1/day}}
+parameters: {r: {value: 0.3, unit: 1/day}}
+nodes:
+  flies: {unit: "1", storage: 1, initial: 10}
+flows:
+  death: {from: flies, rate: r * flies}
+  arrival: {into: flies, rate: fed}
+outputs:
+  count: {value: flies, unit: "1", noise: 1}
+"""
+
+
+@pytest.mark.parametrize("stated", ["", ", unit: 1/day"])
+def test_rates_for_a_day_are_told_where_the_node_counts_seconds(stated):
+    """They were taken for rates in 1/s, and the file was good."""
+
+    def told(text):
+        return [f.what for f in file_findings(loads(text)) if f.kind == "unit"]
+
+    text = FLIES.replace("* flies}", f"* flies{stated}}}").replace("rate: fed}", f"rate: fed{stated}}}")
+    assert ["storage times node per second" in what for what in told(text)] == [True, True]
+    assert not told(text.replace("1/day", "1/s"))
+    assert not told(FLIES.replace("r * flies", "r * flies / 86400").replace("rate: fed", "rate: fed / 86400"))
 
 
 RADIATION = (

@@ -49,6 +49,24 @@ def unconverted(plant: Plant) -> Iterator[tuple[Finding, Plant]]:
             turned = replace(f, rate=ex.mul(ex.num(factor), f.rate))
             finding = _finding(plant, f"the rate of '{f.name}'", f.rate, f.unit, f.at, factor)
             yield finding, replace(plant, flows={**plant.flows, f.name: turned})
+        elif factor := _of_another_node(plant, f, sizes):
+            turned = replace(f, rate=ex.mul(ex.num(factor), f.rate))
+            unit = f"is stated in {f.unit}" if f.unit else f"has the unit of '{f.rate}'"
+            told = f"the rate of '{f.name}' {unit}, but its node asks for storage times node per second: nothing converts it"
+            todo = f"Multiply the rate by {factor:.6g}, and state the unit that it has then."
+            finding = Finding("unit", f"{plant.file}:{f.at}", told, todo, severe=False)
+            yield finding, replace(plant, flows={**plant.flows, f.name: turned})
+
+
+def _of_another_node(plant: Plant, f: Flow, sizes: Mapping[str, float | None]) -> float | None:
+    """Return the size of a flow's unit in that of its node; None if equal or unknown."""
+    given = size_of(f.unit) if f.unit else _size(f.rate, sizes)
+    for n in (plant.nodes[e] for e in (f.source, f.target) if e):
+        storage = 1.0 if n.storage is ex.ONE else _size(n.storage, sizes)
+        node = size_of(n.unit) if n.unit else None
+        if given and storage and node and not np.isclose(given / (storage * node), 1.0, SAME, 0):
+            return given / (storage * node)
+    return None
 
 
 def _finding(plant: Plant, what: str, e: Expr, unit: str | None, at: str, factor: float) -> Finding:
@@ -59,22 +77,26 @@ def _finding(plant: Plant, what: str, e: Expr, unit: str | None, at: str, factor
 
 def _unconverted(e: Expr, unit: str | None, sizes: Mapping[str, float | None]) -> float | None:
     """Return the size of an expression's unit in the stated one; None if equal, unknown or converted."""
-    size = size_of(unit) if unit else None
+    stated, size = size_of(unit) if unit else None, _size(e, sizes)
+    return size / stated if stated and size and not np.isclose(size / stated, 1.0, SAME, 0) else None
+
+
+def _size(e: Expr, sizes: Mapping[str, float | None]) -> float | None:
+    """Return the size of an expression's unit in SI units; None if unknown, or if a number may convert."""
     known = {q: sizes.get(q) for q in ex.names(e)}
     exponents = {p for q in ex.walk(e) if q.op == "**" for p in ex.walk(q.args[1])}
     numbers = [q for q in ex.walk(e) if q.op in ("num", "fmu", "table", "first") and q not in exponents]
-    if size is None or not known or numbers or None in known.values():
+    if not known or numbers or None in known.values():
         return None
     factors = []
     for seed in range(POINTS):
-        values = dict(
-            zip(sorted(known), np.random.default_rng(seed).uniform(0.5, 2.0, len(known)), strict=True)
-        )
+        drawn = np.random.default_rng(seed).uniform(0.5, 2.0, len(known))
+        values = dict(zip(sorted(known), drawn, strict=True))
         in_si = {q: v * float(known[q] or 1.0) for q, v in values.items()}
         with np.errstate(all="ignore"):
-            factors.append(float(np.divide(value_of(e, in_si), value_of(e, values))) / size)
+            factors.append(float(np.divide(value_of(e, in_si), value_of(e, values))))
     same = np.isfinite(factors).all() and np.allclose(factors, factors[0], SAME, 0)
-    return factors[0] if same and not np.isclose(factors[0], 1.0, SAME, 0) else None
+    return factors[0] if same else None
 
 
 def _values(plant: Plant, seed: int = 0) -> dict[str, float]:

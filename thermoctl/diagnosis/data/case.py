@@ -9,6 +9,7 @@ from functools import cached_property
 from threading import Lock
 
 import numpy as np
+from scipy.special import bdtrc
 
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
@@ -33,6 +34,7 @@ STATED = 12  # least number if the plant file states the output's noise, so that
 ACCURATE = 1e-3  # relative local error of a simulation, over (noise / range) of an output; at most LARGEST
 LARGEST = 1e-5
 FAST = 0.01  # share of an output's changes that may be jumps
+CHANCE = 0.05  # chance of so many outliers right after switches, below which the plant answers there
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
 LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
@@ -310,12 +312,14 @@ def without_outliers(
 ) -> tuple[list[Table], Outliers]:
     """Return the recordings without cells whose residual is far from its neighbours', and these cells.
 
-    Where inputs switch, an error of several rows may be an answer to that. So may one at the end be.
+    Where inputs switch, an error of several rows may be an answer to that. So may one at the end be, and one
+    of a single row if more of these come right after switches than by chance.
     `as_stated`: residuals with the stated initial states. First readings that these predict are no outliers:
     their large residual is due to an initial state that the refit moved."""
     out, dropped = [], []
     for t, d, e, stated in zip(tables, drives, residuals, as_stated, strict=True):
-        columns, switched = dict(t.columns), any(switches(u).any() for u in d.u.T)
+        columns, after = dict(t.columns), _after_switches(d)
+        switched = bool(after.any())
         for j, o in enumerate(plant.outputs.values()):
             index = np.flatnonzero(np.isfinite(e[:, j]))
             if len(index) < LEAST:
@@ -326,13 +330,29 @@ def without_outliers(
             far = (np.abs(away) > limit) & (_from_neighbours(e[index, j]) > limit) & ~predicted
             lasts = ~_lonely(e[index, j])
             lasts[:-1] &= switched  # nothing but a switch is answered so quickly
-            odd = index[far & ~lasts]
+            odd = _without_answers(index[far & ~lasts], after)
             if len(odd) and far.sum() < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
                 columns[o.column][odd] = np.nan
                 dropped.append((t.name, o.column, tuple(float(at) for at in t.t[odd] - t.t[0])))
         out.append(dataclasses.replace(t, columns=columns))
     return out, tuple(dropped)
+
+
+def _after_switches(d: Excitation) -> np.ndarray:
+    """Return which rows (N,) are the first two in which an input that switched may act."""
+    after = np.zeros(len(d.t), bool)
+    for u in d.u.T:
+        rows = np.flatnonzero(switches(u)) + 1
+        after[np.concatenate([rows, np.minimum(rows + 1, len(after) - 1)])] = True
+    return after
+
+
+def _without_answers(odd: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the rows of outliers without those that the plant answers a switch with."""
+    answers = after[odd]
+    by_chance = bdtrc(float(answers.sum()) - 1, len(odd), after.mean()) if answers.any() else 1.0
+    return odd[~answers] if by_chance <= CHANCE else odd
 
 
 def _lonely(e: np.ndarray) -> np.ndarray:

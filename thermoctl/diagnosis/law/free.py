@@ -65,7 +65,7 @@ def choices(
     """Return the places at some nodes, each with every signal that a law there may depend on.
 
     A flow between nodes that the plant file does not link has to explain something at both. A node that an
-    effect added is no signal if nothing but a reading depends on it: what a slow gauge shows opens no valve."""
+    effect added is no signal if nothing but a reading depends on it: a slow gauge opens no valve."""
     flows = rig.physics.flows.values()
     links = [{f.source, f.target} for f in flows]
     acting = {n for f in flows if {f.source, f.target} & case.plant.nodes.keys() for n in ex.names(f.rate)}

@@ -129,7 +129,7 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
     combos = choices(case, rig, where, linear.likely[:NODES], linear)
     base, pool, kinds = (log_number(combos), limits), list[Found](), list[list[Proposal]]()
     for part, new in _in_turn(rig, combos):
-        pool = _best_first([*pool, *_terms(rig, linear, ranked(linear, part), COMBINATIONS, new)])
+        pool = _best_first([*pool, *_terms(case, rig, linear, ranked(linear, part), COMBINATIONS, new)])
         out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
         for place in dict.fromkeys(f.place for f in pool):
             out += _sums(linear, place, [f for f in pool if f.place == place], base)
@@ -178,6 +178,7 @@ def _best_first(pool: Sequence[Found]) -> list[Found]:
 
 
 def _terms(
+    case: Case,
     rig: Rig,
     linear: Tracked,
     free: Sequence[tuple[float, Place, Signal]],
@@ -191,7 +192,8 @@ def _terms(
     for place in dict.fromkeys(p for _, p, _ in free[:count]):
         first = [s for _, p, s in free[:count] if p == place]
         own = [s for _, p, s in free if p == place]
-        every = [*own[:SECOND], *rates(rig, place, linear.metric.signals, own)]
+        flows = [s for s in rates(rig, place, linear.metric.signals, own) if s.label in case.plant.flows]
+        every = [*own[:SECOND], *flows]  # a law is no factor of an effect
         pool += _singles(linear, place, first, every, new)
     pool = _best_first(pool)
     return _best_first([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])])
@@ -217,7 +219,9 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
         for n, other in (best, best[::-1]):
             beside = linear.beside(other, couples[best][1])
             free = ranked(beside, [c for c in part if c[0] == Place(n)])
-            single = [f for f in _varied(_terms(rig, beside, free, EACH)) if len(f.term.form.sizes) == 1]
+            single = [
+                f for f in _varied(_terms(case, rig, beside, free, EACH)) if len(f.term.form.sizes) == 1
+            ]
             each.append(single[:EACH])
         both = [p for p in itertools.product(*each) if not new or _reads([f.term for f in p], new)]
         out += _couples([_couple(linear, a, b, base) for a, b in both])
