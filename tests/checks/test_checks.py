@@ -382,6 +382,14 @@ def test_a_body_at_rest_by_dry_friction_is_no_hung_sensor():
     assert [f.kind for f in checks(plant, [hung]) if f.severe] == ["stuck"]
 
 
+def test_each_stretch_that_hangs_is_told():
+    """One was told at a time: who emptied its cells met the next one in the next run."""
+    plant, table = rig(TWO)
+    hung = column("temperature_1", lambda v: frozen(100, 200)(frozen(420, 540)(v)))(table)
+    told = [f.what for f in checks(plant, [hung]) if f.severe]
+    assert len(told) == 2 and all("'temperature_1' stands at" in what for what in told)
+
+
 def test_a_free_swing_needs_no_input_that_moves():
     """Found on a flexible link that rings after its release; a swing that nothing in the plant explains needs one."""
     plant, table = released(dry=0.0, seconds=6.0)

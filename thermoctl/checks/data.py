@@ -274,10 +274,12 @@ def _wrapped(
 def _stuck(
     table: Table, column: str, y: np.ndarray, simulated: np.ndarray, t: np.ndarray, sd: float
 ) -> list[Finding]:
-    """Find a run of one value that is too long for chance, while the plant moves.
+    """Find runs of one value, the longest first, that are too long for chance while the plant moves.
 
     At the end of the readings' range it is a sensor at its limit, which is physics. So is a body at rest: it
     comes to rest slowly, and leaves without a jump."""
+    if len(y) <= FEW:
+        return []
     edges = np.flatnonzero(np.diff(y) != 0)
     begins, ends = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(y) - 1]])
     k = int(np.argmax(ends - begins))
@@ -303,4 +305,6 @@ def _stuck(
         return []
     what = f"'{column}' stands at {y[a]:.6g} from t = {t[a]:.6g} to {t[b]:.6g} s while the plant moves"
     advice = "The sensor or its bus hung: empty those cells, or cut the recording."
-    return [Finding("stuck", table.path, what, advice)]
+    others = np.delete(np.arange(len(y)), np.s_[a : b + 1])
+    more = _stuck(table, column, y[others], simulated[others], t[others], sd)
+    return [Finding("stuck", table.path, what, advice), *more]
