@@ -78,7 +78,25 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         say("looking for laws at two places")
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
+    s.tried = {keys: _known(s, w) for keys, w in s.tried.items()}
     return searched(s)
+
+
+def _known(s: Search, w: Weighed) -> Weighed:
+    """Return a hypothesis; with the odds `rare` once more where an effect was tried in place of its law.
+
+    Known physics at a node is likelier than an unknown law there that imitates it."""
+    keys = w.fitted.hypothesis.keys
+    for law in laws_of(w.fitted):
+        nodes = {*law.proposal.place.nodes}
+        for other, tried in s.tried.items():
+            if keys - other == {law.key} and len(new := other - keys) == 1:
+                (e,) = (e for e in tried.fitted.hypothesis.effects if e.key in new)
+                flow = tried.fitted.plant.flows.get(e.candidate.place.flow or "")
+                ends = {flow.source, flow.target} if flow else set()
+                if e.key[0] != LAW and nodes & {*e.candidate.place.nodes.values(), *ends}:
+                    return replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
+    return w
 
 
 def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:
