@@ -5,6 +5,8 @@ timed is the arrival of the command at the drive, in several phases of its neigh
 """
 
 import contextlib
+import multiprocessing
+import os
 import socket
 import struct
 import threading
@@ -20,9 +22,14 @@ from tests.hazards.harness import ROWS, Row
 from tests.rigs.wire import HEAD, SENSED, TORQUE, WireRig
 from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.rig.make import disable_amplifier, driving_devices
+from thermoctl_hal.modbus import link as links
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.board import Board
+from thermoctl_hal.rig.make import disable_amplifier, driver, driving_devices
+from thermoctl_hal.rig.poller import run_poller
 
 PHASES = 8
+STOP_S = 2.5
 ANSWER_S = 0.4  # time limit of the dead units, below the 0.5 s in which the drive has to answer
 SPARE = [f"spare_{k}" for k in range(1, 4)]
 THERMOMETER = f"""{HEAD}bus: modbus
@@ -163,8 +170,29 @@ def test_a_disarm_waits_for_no_neighbour(tmp_path, case):
         begin = time.monotonic()
         assert rig.daemon.stop() == 0
         stop_s = time.monotonic() - begin
+    assert stop_s < STOP_S
     figures = f"disarm {disarm_s * 1e3:.0f} ms, fault {fault_s * 1e3:.0f} ms; daemon ended in {stop_s:.1f} s"
     ROWS.append(Row("Disarm", case, f"{ANSWER_S / 2 * 1e3:.0f} ms", figures, "safe command at the drive", ""))
+
+
+@pytest.mark.parametrize("kind", ["black hole", "half-open"])
+def test_a_poller_that_drives_nothing_ends_soon(tmp_path, kind, monkeypatch):
+    """Its host has 8 s to answer, and was silent at several connections already."""
+    with contextlib.ExitStack() as stack:
+        port = f"tcp:127.0.0.1:{dead_host(stack, kind)}"
+        (tmp_path / "thermometer.yaml").write_text(THERMOMETER.replace(f"{ANSWER_S}", "8"))
+        node = f"{{name: dead, profile: thermometer.yaml, port: '{port}', roles: {{t0: coil_c}}}}"
+        monkeypatch.setitem(links._SILENT, port, len(links.SETTLE_S) - 1)
+        device = driver(bind(yamlfile.loads(node), tmp_path))
+        board = Board.create(f"thermoctl-test-{os.getpid()}", len(device.binding.channels.names))
+        stack.callback(board.close)
+        poller = multiprocessing.get_context("fork").Process(target=run_poller, args=([device], board.name))
+        poller.start()
+        time.sleep(0.5)  # until it waits: for the connection, or before its first reading
+        begin = time.monotonic()
+        poller.terminate()
+        poller.join(9)
+        assert time.monotonic() - begin < 2.0
 
 
 def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
