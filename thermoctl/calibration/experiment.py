@@ -18,6 +18,7 @@ from thermoctl.configuration.settings import Settings
 from thermoctl.files.safe_file import WriteError, check_writable, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
+from thermoctl.interrupt import STATUS
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import table_kind, write_table
@@ -63,7 +64,7 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    Returns 1 when the user answered no, ENDED when it ended early."""
+    Returns 1 when the user answered no, ENDED when it ended early, STATUS when the user ended it."""
     schedules.within_limits(settings, [schedule])
     if path.exists() and not dry_run and not (resume and _progress(path).exists()):
         raise InputError(f"{path}: exists, and is never overwritten; name another file by --out")
@@ -150,4 +151,4 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
         f"go on with --resume --out {path}",
         file=sys.stderr,
     )
-    return ENDED
+    return STATUS if keyboard.ended else ENDED
