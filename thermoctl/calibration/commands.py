@@ -174,7 +174,7 @@ def calibrate(
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)
     if again and (folder / "state.json").exists():
-        for path in [folder / "state.json", *folder.glob("test_*.part.parquet")]:
+        for path in [folder / "state.json", *folder.glob("test_*.part.parquet*")]:
             path.unlink()
     tests = experiments.load_experiments(schedules.of_config(config))
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
