@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoctl.control import faults
+from thermoctl.files.safe_file import WriteError, reason
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
@@ -136,9 +137,10 @@ def kept(
                     stream = stream or StreamFile(stream_of(path), schema(layout.signals, {}))
                     stream.write(np.vstack(waiting))
                     written_s, waiting = time.monotonic(), []
-                except (OSError, InputError) as e:
+                except (OSError, WriteError) as e:
                     written_s = math.inf
-                    print(f"thermoctl: {e}; the test goes on, its rows are in memory only", file=sys.stderr)
+                    why = e.why if isinstance(e, WriteError) else f"{stream_of(path)}: {reason(e)}"
+                    print(f"thermoctl: {why}; the test goes on, its rows are in memory only", file=sys.stderr)
             yield block
     finally:
         if stream is not None:
