@@ -15,7 +15,7 @@ import time
 import pytest
 
 from tests.daemon.process import Daemon, wait
-from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port
+from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port, modbus_crc
 from tests.devices.test_drives import AXIS_DBC, Drive, modbus
 from tests.hal.conftest import make_settings
 from tests.hazards.harness import ROWS, Row
@@ -97,6 +97,7 @@ class Neighbours:
             wire.close()
             wire = Port(ModbusLine({3: wire.take.__self__.units[3]}, False).take)
             self.port = f"tcp:127.0.0.1:{wire.number}"
+        self.wire = wire
         self.stack.callback(wire.close)
         (folder / "servo.yaml").write_text(profile)
         self.axis.torque, frames = drive, self.axis.frames
@@ -245,3 +246,77 @@ def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
             f"`{failed[0][:60]}`",
         )
     )
+
+
+@pytest.mark.parametrize("code", [5, 6])
+def test_a_busy_unit_takes_the_safe_command_at_the_next_try(tmp_path, code):
+    """Before, one such answer lost the drive, and two delayed the safe command from 6 ms to 254 ms."""
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device, honest, busy = driver(bind(yamlfile.loads(node), tmp_path)), wire.take, [0]
+
+    def take(data):
+        if busy[0] and data[1:2] in (b"\x06", b"\x10"):
+            busy[0] -= 1
+            answer = bytes((data[0], data[1] | 0x80, code))
+            return answer + modbus_crc(answer)
+        return honest(data)
+
+    wire.take = take
+    with contextlib.closing(wire):
+        device.connect()
+        drive.request(8)
+        busy[0] = 2
+        device.write(0.0, False, time.monotonic())
+        assert drive.state == 1 and not busy[0]
+        busy[0] = 3
+        device.sequencer.send_again()
+        with pytest.raises(HardwareError, match=f"exception {code} "):
+            device.write(0.0, False, time.monotonic())
+        device.disconnect()
+
+
+def another_unit(take):
+    """Answer with the id of the next unit (Modbus TCP: byte 6)."""
+    return lambda data: bytes(byte + (k == 6) for k, byte in enumerate(take(data)))
+
+
+def one_late(take):
+    """Answer each request when the next one comes."""
+    waiting = [b""]
+
+    def late(data):
+        waiting.append(take(data))
+        return waiting.pop(0)
+
+    return late
+
+
+SPOILED = {
+    "drive on Modbus TCP: another master disables it": None,
+    "drive on Modbus TCP: every answer has another unit's id": another_unit,
+    "drive on Modbus TCP: every answer is one request late": one_late,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SPOILED)
+def test_a_drive_that_another_master_or_its_gateway_spoils(tmp_path, case):
+    rig = Neighbours(tmp_path, [], "tcp")
+    with rig.stack:
+        rig.daemon.armed()
+        wait(lambda: rig.axis.torque.state == 8, "driven")
+        begin, spoil = time.monotonic(), SPOILED[case]
+        if spoil is None:
+            rig.axis.torque.state = 1
+        else:
+            rig.wire.take = spoil(rig.wire.take)
+        wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT")
+        fault_s = time.monotonic() - begin
+        wait(lambda: rig.axis.torque.output == 0.0 and rig.axis.torque.state == 1, "no current")
+        off_s = time.monotonic() - begin
+        (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
+    assert fault_s < 0.5 and off_s < 1.2  # the drive's own watchdog: 0.6 s after the last command
+    figures = f"FAULT after {fault_s * 1e3:.0f} ms, no current after {off_s * 1e3:.0f} ms"
+    ROWS.append(Row("Disarm", case, "0.5 s, 1.2 s", figures, "amplifier off", f"`{fault}`"))
