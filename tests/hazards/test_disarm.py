@@ -277,6 +277,21 @@ def test_a_busy_unit_takes_the_safe_command_at_the_next_try(tmp_path, code):
         device.disconnect()
 
 
+@pytest.mark.parametrize("end", ["disconnect", "switch_off"])
+def test_a_drive_without_valid_answers_gets_every_message_that_disables(tmp_path, end):
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device, honest = driver(bind(yamlfile.loads(node), tmp_path)), wire.take
+    with contextlib.closing(wire):
+        device.connect()
+        drive.request(8)
+        wire.take = lambda data: honest(data)[:-1]
+        with contextlib.suppress(HardwareError):
+            getattr(device, end)()
+        assert drive.state == 1
+
+
 def another_unit(take):
     """Answer with the id of the next unit (Modbus TCP: byte 6)."""
     return lambda data: bytes(byte + (k == 6) for k, byte in enumerate(take(data)))
@@ -317,6 +332,6 @@ def test_a_drive_that_another_master_or_its_gateway_spoils(tmp_path, case):
         wait(lambda: rig.axis.torque.output == 0.0 and rig.axis.torque.state == 1, "no current")
         off_s = time.monotonic() - begin
         (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
-    assert fault_s < 0.5 and off_s < 1.2  # the drive's own watchdog: 0.6 s after the last command
+    assert max(fault_s, off_s) < 0.5  # the drive's own watchdog: 0.6 s after the last command
     figures = f"FAULT after {fault_s * 1e3:.0f} ms, no current after {off_s * 1e3:.0f} ms"
-    ROWS.append(Row("Disarm", case, "0.5 s, 1.2 s", figures, "amplifier off", f"`{fault}`"))
+    ROWS.append(Row("Disarm", case, "0.5 s", figures, "amplifier off", f"`{fault}`"))
