@@ -196,6 +196,30 @@ def test_a_poller_that_drives_nothing_ends_soon(tmp_path, kind, monkeypatch):
         assert time.monotonic() - begin < 2.0
 
 
+def test_a_poller_that_is_asked_twice_to_end_disables_its_drive(tmp_path):
+    """The supervisor asks every helper, then each again. Before, the second signal could stop it for good."""
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device = driver(bind(yamlfile.loads(node), tmp_path))
+    board = Board.create(f"thermoctl-test-{os.getpid()}", len(device.binding.channels.names))
+    with contextlib.closing(wire), contextlib.closing(board):
+        for _ in range(10):
+            poller = multiprocessing.get_context("fork").Process(
+                target=run_poller, args=([device], board.name)
+            )
+            polls = board.beat(device.roles)
+            poller.start()
+            wait(lambda polls=polls: board.beat(device.roles) > polls, "the first poll")
+            drive.request(8)
+            for _ in range(100):
+                poller.terminate()
+                time.sleep(1e-4)
+            poller.join(5.0)
+            poller.kill()
+            assert poller.exitcode == 0 and drive.state == 1
+
+
 def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
     """The loop is gone; the first drive's host makes no connection for its time limit of a second."""
     heard, drive = threading.Event(), Drive()

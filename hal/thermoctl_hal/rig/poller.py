@@ -119,18 +119,19 @@ def run_poller(devices: list[Device], board_name: str) -> None:
     """Run a poller process for the devices of a port, until SIGTERM or until the parent is gone."""
     board = Board.attach(board_name)
     stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    # A thread takes SIGTERM: a handler could interrupt `stop` itself, and wait for good for its lock.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the group; the supervisor stops us
     parent = os.getppid()
 
-    def watch_parent() -> None:
-        """Set `stop` within 0.5 s after the parent process has ended; then see that this one ends."""
-        while not stop.wait(0.5):
-            if os.getppid() != parent:
-                stop.set()
+    def watch() -> None:
+        """Set `stop` at SIGTERM, or within 0.5 s after the parent has ended; then see that this one ends."""
+        while signal.sigtimedwait([signal.SIGTERM], 0.5) is None and os.getppid() == parent:
+            pass
+        stop.set()
         if not any(d.drives for d in devices):
             time.sleep(END_S)
             os._exit(0)  # still waiting for a host: to connect, or for its name
 
-    threading.Thread(target=watch_parent, daemon=True).start()
+    threading.Thread(target=watch, daemon=True).start()
     poll_until(devices, board, stop)
