@@ -359,3 +359,35 @@ def test_a_drive_that_another_master_or_its_gateway_spoils(tmp_path, case):
     assert max(fault_s, off_s) < 0.5  # the drive's own watchdog: 0.6 s after the last command
     figures = f"FAULT after {fault_s * 1e3:.0f} ms, no current after {off_s * 1e3:.0f} ms"
     ROWS.append(Row("Disarm", case, "0.5 s", figures, "amplifier off", f"`{fault}`"))
+
+
+@pytest.mark.slow
+def test_another_master_that_enables_a_disarmed_drive(tmp_path):
+    """It drives 0.5 A at 100 Hz. Each of our disabling messages ends that for 10 ms."""
+    rig, stop = Neighbours(tmp_path, [], "tcp"), threading.Event()
+
+    def drive():
+        while not stop.wait(0.01):
+            rig.axis.torque.request(8)
+            rig.axis.torque.feed(0.5)
+
+    with rig.stack:
+        begin, thread = time.monotonic(), threading.Thread(target=drive)
+        thread.start()
+        rig.stack.callback(thread.join)
+        rig.stack.callback(stop.set)
+        wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT", 8.0)
+        fault_s, again = time.monotonic() - begin, rig.safe_s
+        (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
+        _, repeated_s = wait(lambda: rig.safe_s > again, "the safe command again", 1.0)
+    assert fault == "coil_stuck_on" and fault_s < 2.0
+    ROWS.append(
+        Row(
+            "Disarm",
+            "drive on Modbus TCP, disarmed: another master enables it at 100 Hz",
+            "2 s",
+            f"FAULT after {fault_s * 1e3:.0f} ms",
+            f"safe command repeated, the next after {repeated_s * 1e3:.0f} ms",
+            f"`{fault}`",
+        )
+    )
