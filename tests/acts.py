@@ -28,7 +28,7 @@ _THROUGH = (
     "drives through that daemon with its law and protection, from READY only, and disarms at its end; a rig that is "
     "ARMED or in FAULT is not touched"
 )
-_MOVED = "0; 1 the answer was not `go`; 2 nobody can be asked; 3 the rig refuses, or it ended early"
+_MOVED = "0; 1 the answer was not `go`; 2 nobody can be asked; 3 the rig refuses, or it ended early; 130 the user ended it"
 ACTS = (
     Act(
         "run",
@@ -101,7 +101,7 @@ ACTS = (
         "with --resolve: runs the proposed experiment",
         _MOVES,
         _THROUGH,
-        "0; 2 the answer was not `go`, or nobody can be asked; 3 the rig refuses, or it ended early",
+        "0; 2 the answer was not `go`, or nobody can be asked; 3 the rig refuses, or it ended early; 130 the user ended it",
     ),
     Act(
         "dashboard",

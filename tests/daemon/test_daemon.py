@@ -455,7 +455,7 @@ def test_what_a_session_recorded_replays_to_the_bit(config, capsys):
         wait(lambda: on_disk(daemon, 2) > 1000, "the second file's rows on the disk")
         os.kill(daemon.child("recorder"), signal.SIGKILL)
         wait(lambda: "recorder ended, started again" in daemon.log, "its end is noticed")
-        wait(lambda: on_disk(daemon, 3) > 1000, "it records again")
+        wait(lambda: on_disk(daemon, 3) > 2000, "it records again")
         now = daemon.ask("status")
         assert now["state"] == "ARMED", now["faults"]
         daemon.ask("disarm")

@@ -86,8 +86,9 @@ def test_every_signal_ends_it_with_the_amplifier_disabled(shown, how):
 def test_a_signal_while_a_module_is_imported_still_ends_it_with_status_0():
     """Before, a demo that got SIGTERM while a data class was made ended with SIGINT (seen once in CI)."""
     code = (
-        "import contextlib\nfrom thermoctl.daemon.views import demo\n"
-        "with contextlib.suppress(KeyboardInterrupt), demo._stopped_by_signals():\n"
+        "import contextlib\nfrom thermoctl.interrupt import raise_on_signals\n"
+        "raise_on_signals()\n"
+        "with contextlib.suppress(KeyboardInterrupt):\n"
         "    exec('import os, signal; os.kill(os.getpid(), signal.SIGTERM)')\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False)

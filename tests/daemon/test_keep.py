@@ -31,3 +31,20 @@ def test_a_model_that_differs_in_its_notes_alone_is_the_same(tmp_path):
     path = tmp_path / "kept.state"
     keep.save(path, ONE, np.arange(5.0))
     assert keep.load(path, dataclasses.replace(ONE, meta={"made_from": "another day"}))[0] is not None
+
+
+def test_no_flipped_bit_gives_other_estimates(tmp_path):
+    """Before, 239 of 400 files with one flipped bit gave other estimates, which the compensation starts from."""
+    path, state, rng = (
+        tmp_path / "kept.state",
+        np.random.default_rng(0).normal(22.0, 1.0, 200),
+        np.random.default_rng(1),
+    )
+    keep.save(path, ONE, state)
+    whole = path.read_bytes()
+    for place in rng.integers(len(whole), size=400):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        found = keep.load(path, ONE)[0]
+        assert found is None or np.array_equal(found, state)

@@ -4,6 +4,8 @@ import socket
 
 import pytest
 
+from tests.simulated import rig_file
+from thermoctl.cli import main
 from thermoctl.daemon.command_server import listen
 from thermoctl.files.yamlfile import InputError
 
@@ -25,3 +27,12 @@ def test_a_socket_that_a_killed_daemon_left_is_replaced(tmp_path):
     listener = listen(path, None)
     socket.socket(socket.AF_UNIX).connect(str(path))
     listener.close()
+
+
+def test_a_daemon_does_not_start_where_a_file_is_at_its_socket(tmp_path, capsys):
+    """Before, its loop ran without a command socket, and `start` waited 90 s."""
+    config = rig_file(tmp_path)
+    (tmp_path / "simulated.sock").write_text("mine")
+    assert main(["start", "--config", str(config)]) == 3
+    assert "simulated.sock: a file that is no socket is there, and is kept" in capsys.readouterr().err
+    assert (tmp_path / "simulated.sock").read_text() == "mine"

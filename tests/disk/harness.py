@@ -300,6 +300,8 @@ def examine(
         found.append(f"left: {', '.join(left)}")
     if case.status < 0 or "Traceback" in case.err:
         found.append(f"ended by signal or traceback: {case.err[-300:]}")
+    elif "[Errno" in case.err:
+        found.append(f"no words for the error: {case.err[-300:]!r}")
     elif case.status and sum(line.startswith("thermoctl: ") for line in case.err.splitlines()) != 1:
         found.append(f"no single line: {case.err[-300:]!r}")
     elif not case.status and not writer.always and _names(now) != _names(after):

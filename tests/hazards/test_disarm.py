@@ -5,6 +5,8 @@ timed is the arrival of the command at the drive, in several phases of its neigh
 """
 
 import contextlib
+import multiprocessing
+import os
 import socket
 import struct
 import threading
@@ -13,16 +15,21 @@ import time
 import pytest
 
 from tests.daemon.process import Daemon, wait
-from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port
+from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port, modbus_crc
 from tests.devices.test_drives import AXIS_DBC, Drive, modbus
 from tests.hal.conftest import make_settings
 from tests.hazards.harness import ROWS, Row
 from tests.rigs.wire import HEAD, SENSED, TORQUE, WireRig
 from thermoctl.files import yamlfile
 from thermoctl_hal.base.backend import HardwareError
-from thermoctl_hal.rig.make import disable_amplifier, driving_devices
+from thermoctl_hal.modbus import link as links
+from thermoctl_hal.profiles.bind import bind
+from thermoctl_hal.rig.board import Board
+from thermoctl_hal.rig.make import disable_amplifier, driver, driving_devices
+from thermoctl_hal.rig.poller import run_poller
 
 PHASES = 8
+STOP_S = 2.5
 ANSWER_S = 0.4  # time limit of the dead units, below the 0.5 s in which the drive has to answer
 SPARE = [f"spare_{k}" for k in range(1, 4)]
 THERMOMETER = f"""{HEAD}bus: modbus
@@ -90,6 +97,7 @@ class Neighbours:
             wire.close()
             wire = Port(ModbusLine({3: wire.take.__self__.units[3]}, False).take)
             self.port = f"tcp:127.0.0.1:{wire.number}"
+        self.wire = wire
         self.stack.callback(wire.close)
         (folder / "servo.yaml").write_text(profile)
         self.axis.torque, frames = drive, self.axis.frames
@@ -163,8 +171,53 @@ def test_a_disarm_waits_for_no_neighbour(tmp_path, case):
         begin = time.monotonic()
         assert rig.daemon.stop() == 0
         stop_s = time.monotonic() - begin
+    assert stop_s < STOP_S
     figures = f"disarm {disarm_s * 1e3:.0f} ms, fault {fault_s * 1e3:.0f} ms; daemon ended in {stop_s:.1f} s"
     ROWS.append(Row("Disarm", case, f"{ANSWER_S / 2 * 1e3:.0f} ms", figures, "safe command at the drive", ""))
+
+
+@pytest.mark.parametrize("kind", ["black hole", "half-open"])
+def test_a_poller_that_drives_nothing_ends_soon(tmp_path, kind, monkeypatch):
+    """Its host has 8 s to answer, and was silent at several connections already."""
+    with contextlib.ExitStack() as stack:
+        port = f"tcp:127.0.0.1:{dead_host(stack, kind)}"
+        (tmp_path / "thermometer.yaml").write_text(THERMOMETER.replace(f"{ANSWER_S}", "8"))
+        node = f"{{name: dead, profile: thermometer.yaml, port: '{port}', roles: {{t0: coil_c}}}}"
+        monkeypatch.setitem(links._SILENT, port, len(links.SETTLE_S) - 1)
+        device = driver(bind(yamlfile.loads(node), tmp_path))
+        board = Board.create(f"thermoctl-test-{os.getpid()}", len(device.binding.channels.names))
+        stack.callback(board.close)
+        poller = multiprocessing.get_context("fork").Process(target=run_poller, args=([device], board.name))
+        poller.start()
+        time.sleep(0.5)  # until it waits: for the connection, or before its first reading
+        begin = time.monotonic()
+        poller.terminate()
+        poller.join(9)
+        assert time.monotonic() - begin < 2.0
+
+
+def test_a_poller_that_is_asked_twice_to_end_disables_its_drive(tmp_path):
+    """The supervisor asks every helper, then each again. Before, the second signal could stop it for good."""
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device = driver(bind(yamlfile.loads(node), tmp_path))
+    board = Board.create(f"thermoctl-test-{os.getpid()}", len(device.binding.channels.names))
+    with contextlib.closing(wire), contextlib.closing(board):
+        for _ in range(10):
+            poller = multiprocessing.get_context("fork").Process(
+                target=run_poller, args=([device], board.name)
+            )
+            polls = board.beat(device.roles)
+            poller.start()
+            wait(lambda polls=polls: board.beat(device.roles) > polls, "the first poll")
+            drive.request(8)
+            for _ in range(100):
+                poller.terminate()
+                time.sleep(1e-4)
+            poller.join(5.0)
+            poller.kill()
+            assert poller.exitcode == 0 and drive.state == 1
 
 
 def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
@@ -215,5 +268,126 @@ def test_the_supervisor_disables_a_drive_beside_one_on_a_dead_host(tmp_path):
             f"the other's command after {took_s * 1e3:.0f} ms",
             "by the supervisor",
             f"`{failed[0][:60]}`",
+        )
+    )
+
+
+@pytest.mark.parametrize("code", [5, 6])
+def test_a_busy_unit_takes_the_safe_command_at_the_next_try(tmp_path, code):
+    """Before, one such answer lost the drive, and two delayed the safe command from 6 ms to 254 ms."""
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device, honest, busy = driver(bind(yamlfile.loads(node), tmp_path)), wire.take, [0]
+
+    def take(data):
+        if busy[0] and data[1:2] in (b"\x06", b"\x10"):
+            busy[0] -= 1
+            answer = bytes((data[0], data[1] | 0x80, code))
+            return answer + modbus_crc(answer)
+        return honest(data)
+
+    wire.take = take
+    with contextlib.closing(wire):
+        device.connect()
+        drive.request(8)
+        busy[0] = 2
+        device.write(0.0, False, time.monotonic())
+        assert drive.state == 1 and not busy[0]
+        busy[0] = 3
+        device.sequencer.send_again()
+        with pytest.raises(HardwareError, match=f"exception {code} "):
+            device.write(0.0, False, time.monotonic())
+        device.disconnect()
+
+
+@pytest.mark.parametrize("end", ["disconnect", "switch_off"])
+def test_a_drive_without_valid_answers_gets_every_message_that_disables(tmp_path, end):
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile)
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device, honest = driver(bind(yamlfile.loads(node), tmp_path)), wire.take
+    with contextlib.closing(wire):
+        device.connect()
+        drive.request(8)
+        wire.take = lambda data: honest(data)[:-1]
+        with contextlib.suppress(HardwareError):
+            getattr(device, end)()
+        assert drive.state == 1
+
+
+def another_unit(take):
+    """Answer with the id of the next unit (Modbus TCP: byte 6)."""
+    return lambda data: bytes(byte + (k == 6) for k, byte in enumerate(take(data)))
+
+
+def one_late(take):
+    """Answer each request when the next one comes."""
+    waiting = [b""]
+
+    def late(data):
+        waiting.append(take(data))
+        return waiting.pop(0)
+
+    return late
+
+
+SPOILED = {
+    "drive on Modbus TCP: another master disables it": None,
+    "drive on Modbus TCP: every answer has another unit's id": another_unit,
+    "drive on Modbus TCP: every answer is one request late": one_late,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SPOILED)
+def test_a_drive_that_another_master_or_its_gateway_spoils(tmp_path, case):
+    rig = Neighbours(tmp_path, [], "tcp")
+    with rig.stack:
+        rig.daemon.armed()
+        wait(lambda: rig.axis.torque.state == 8, "driven")
+        begin, spoil = time.monotonic(), SPOILED[case]
+        if spoil is None:
+            rig.axis.torque.state = 1
+        else:
+            rig.wire.take = spoil(rig.wire.take)
+        wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT")
+        fault_s = time.monotonic() - begin
+        wait(lambda: rig.axis.torque.output == 0.0 and rig.axis.torque.state == 1, "no current")
+        off_s = time.monotonic() - begin
+        (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
+    assert max(fault_s, off_s) < 0.5  # the drive's own watchdog: 0.6 s after the last command
+    figures = f"FAULT after {fault_s * 1e3:.0f} ms, no current after {off_s * 1e3:.0f} ms"
+    ROWS.append(Row("Disarm", case, "0.5 s", figures, "amplifier off", f"`{fault}`"))
+
+
+@pytest.mark.slow
+def test_another_master_that_enables_a_disarmed_drive(tmp_path):
+    """It drives 0.5 A at 100 Hz. Each of our disabling messages ends that for 10 ms."""
+    rig, stop = Neighbours(tmp_path, [], "tcp"), threading.Event()
+
+    def drive():
+        while not stop.wait(0.01):
+            rig.axis.torque.request(8)
+            rig.axis.torque.feed(0.5)
+
+    with rig.stack:
+        begin, thread = time.monotonic(), threading.Thread(target=drive)
+        thread.start()
+        rig.stack.callback(thread.join)
+        rig.stack.callback(stop.set)
+        wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT", 8.0)
+        fault_s, again = time.monotonic() - begin, rig.safe_s
+        (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
+        _, repeated_s = wait(lambda: rig.safe_s > again, "the safe command again", 1.0)
+    assert fault == "coil_stuck_on" and fault_s < 2.0
+    ROWS.append(
+        Row(
+            "Disarm",
+            "drive on Modbus TCP, disarmed: another master enables it at 100 Hz",
+            "2 s",
+            f"FAULT after {fault_s * 1e3:.0f} ms",
+            f"safe command repeated, the next after {repeated_s * 1e3:.0f} ms",
+            f"`{fault}`",
         )
     )

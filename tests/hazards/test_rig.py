@@ -294,7 +294,7 @@ def test_a_restart_keeps_the_estimates(quick, tmp_path):
         "{}",
         "[1]",
         text[:-9],
-        text.replace('"version": 1', '"version": 2'),
+        text.replace('"version": 2', '"version": 1'),
         "x" * 99999,
         text.replace('"boot": "', '"boot": "0'),
     ):

@@ -19,6 +19,7 @@ from thermoctl.configuration.settings import Settings, load_settings
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments, modelfile, tuning
+from thermoctl.interrupt import STATUS, Interrupted
 from thermoctl.recording.files import read_table
 from thermoctl_hal.base.backend import HardwareError
 
@@ -39,7 +40,8 @@ def run_experiment(
 
     With a running daemon it runs in real time under the daemon's protections. Without one it runs on the
     simulated back end, faster than real time. An experiment of inputs can also run on a plant file. Returns 1
-    when the user answered no, 3 when it ended early: the rows are kept, and --resume continues from there."""
+    when the user answered no, 3 when it ended early, STATUS when the user ended it. Then the rows are kept,
+    and --resume continues from there."""
     if Path(name).suffix in (".yaml", ".yml"):  # the file of an experiment, not a test of the rig
         inputs = experiment.of_inputs(name)
         if dry_run or plant:
@@ -60,14 +62,15 @@ def run_experiment(
 def record(experiment_file: Path, recording: Path, config: str, plant: str | None, yes: bool = False) -> None:
     """Run an experiment file for `thermoctl diagnose --resolve`.
 
-    Raises HardwareError where it ends early, InputError where the person does not say `go`."""
+    Raises HardwareError where it ends early, Interrupted where the person ends it, and InputError where the
+    person does not say `go`."""
     status = run_experiment(str(experiment_file), config, str(recording), False, False, plant, yes)
     if status == 1:
         raise InputError(
             f"{experiment_file}: not run, the answer was not `go`; diagnosis.json beside it stands"
         )
     if status:
-        raise HardwareError(
+        raise (Interrupted if status == STATUS else HardwareError)(
             f"{experiment_file}: the experiment did not come to its end; what was recorded is in {recording}"
         )
 
@@ -164,14 +167,14 @@ def calibrate(
 ) -> int:
     """Run `thermoctl calibrate`: 0 when every step is done (and accepted, when asked).
 
-    Returns 1 when the user answered no, 3 when a test ended early. Raises InputError for a rig that cannot be
-    calibrated, HardwareError for one that refuses."""
+    Returns 1 when the user answered no, 3 when a test ended early, STATUS when the user ended it. Raises
+    InputError for a rig that cannot be calibrated, HardwareError for one that refuses."""
     load("matplotlib", "calibrate")  # the report needs it: if it is missing, end before any test
     settings = load_settings(config)
     rig = drive.rig_of(settings)
     folder = Path(out or Path("calibration") / settings.rig.name)
     if again and (folder / "state.json").exists():
-        for path in [folder / "state.json", *folder.glob("test_*.part.parquet")]:
+        for path in [folder / "state.json", *folder.glob("test_*.part.parquet*")]:
             path.unlink()
     tests = experiments.load_experiments(schedules.of_config(config))
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
@@ -180,7 +183,7 @@ def calibrate(
     if left and not drive.agreed(rig, left, yes):
         return 1
     if not wizard.run(keyboard):
-        return experiment.ENDED
+        return STATUS if keyboard.ended else experiment.ENDED
     installed = _models(models, settings)
     print("to accept it means to:\n" + "\n".join(f"- {line}" for line in wizard.changes(installed, gains)))
     if not accept and keyboard.interactive:

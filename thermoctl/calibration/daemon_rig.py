@@ -197,20 +197,26 @@ class DaemonRig:
             time.sleep(1.0)
 
     def meanwhile(self, earlier: Table) -> Table | None:
-        """Append to `earlier` the daemon's own rows since then; None if they have a gap above GAP_S."""
-        parts = [rows_of(earlier, self.settings.row)]
+        """Append to `earlier` the daemon's own rows since then; None if they have a gap above GAP_S.
+
+        The last seconds are not in its recording yet: they come from its ring."""
+        rows = rows_of(earlier, self.settings.row)
         wall, folder = AT["wall_s"], Path(self.settings.recording.directory)
         for path in recording_files(folder, TIER) if folder.is_dir() else ():
             with contextlib.suppress(InputError):
-                rows = rows_of(read_table(path), self.settings.row)
-                newest = parts[-1][-1]
-                is_new = (rows[:, wall] > newest[wall]) & (rows[:, AT["t_s"]] > newest[AT["t_s"]])
-                parts.append(rows[is_new])
-                parts = [p for p in parts if len(p)]
-        rows = np.vstack(parts)
+                rows = _extended(rows, rows_of(read_table(path), self.settings.row))
+        newest = Shared.attach(shared_name(self.settings)).ring.read(0)[0]
+        stride = max(1, round(EVERY_S / self.settings.loop.period_s))
+        rows = _extended(rows, newest[newest[:, AT["tick"]] % stride == 0])
         if np.diff(rows[:, wall]).max(initial=0.0) > GAP_S or time.time() - rows[-1, wall] > GAP_S:
             return None
         return as_table(rows, earlier.path, self.settings.row)
+
+
+def _extended(rows: np.ndarray, later: np.ndarray) -> np.ndarray:
+    """Append those of the rows `later` that are newer than the last of `rows`."""
+    is_new = (later[:, AT["wall_s"]] > rows[-1, AT["wall_s"]]) & (later[:, AT["t_s"]] > rows[-1, AT["t_s"]])
+    return np.vstack((rows, later[is_new]))
 
 
 def command_period_s(settings: Settings) -> float:

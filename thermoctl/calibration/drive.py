@@ -26,6 +26,7 @@ from thermoctl.daemon.control_socket import ask
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import Aborted, Schedule
 from thermoctl.identify.tuning import Gains
+from thermoctl.interrupt import Interrupted
 from thermoctl.recording.files import read_table
 from thermoctl.recording.table import Table
 from thermoctl.rig.signals import AT
@@ -113,7 +114,8 @@ def excite(
 ) -> np.ndarray:
     """Record every tick of a short schedule; `gains`: tried for as long as it lasts.
 
-    It is ended at an error of most_um, um. Raises HardwareError when it ends early."""
+    It is ended at an error of most_um, um. Raises HardwareError when it ends early, Interrupted when the user
+    ends it."""
     blocks = []
     run = rig.run(schedule, lambda p: None, keyboard, every_s=0.0, rest=False, gains=gains)
     try:
@@ -127,6 +129,7 @@ def excite(
                         float(rows[-1, AT["t_s"]] - blocks[0][0, AT["t_s"]]),
                     )
     except Aborted as e:
-        raise HardwareError(f"ended after {e.done_s:.1f} s, the amplifier is disabled: {e.reason}") from None
+        kind = Interrupted if keyboard.ended else HardwareError
+        raise kind(f"ended after {e.done_s:.1f} s, the amplifier is disabled: {e.reason}") from None
     rows = np.vstack(blocks)
     return rows[rows[:, AT["state"]] == arming.ARMED]

@@ -4,6 +4,7 @@ A test of setpoints on a rig, or an experiment of inputs on a plant file."""
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 import tempfile
@@ -13,11 +14,12 @@ import numpy as np
 
 from thermoctl.calibration import drive, schedules
 from thermoctl.calibration.keyboard import Keyboard
-from thermoctl.calibration.recorded import as_table
+from thermoctl.calibration.recorded import as_table, kept, recover, stream_of
 from thermoctl.configuration.settings import Settings
 from thermoctl.files.safe_file import WriteError, check_writable, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import experiments
+from thermoctl.interrupt import STATUS
 from thermoctl.plant import load
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.files import table_kind, write_table
@@ -63,10 +65,11 @@ def on_rig(
 ) -> int:
     """Describe a test of setpoints, ask, run it on the rig and record it.
 
-    Returns 1 when the user answered no, ENDED when it ended early."""
+    Returns 1 when the user answered no, ENDED when it ended early, STATUS when the user ended it."""
     schedules.within_limits(settings, [schedule])
-    if path.exists() and not dry_run and not (resume and _progress(path).exists()):
-        raise InputError(f"{path}: exists, and is never overwritten; name another file by --out")
+    there = [p for p in (stream_of(path), path) if p.exists()]
+    if there and not dry_run and not (resume and _progress(path).exists()):
+        raise InputError(f"{there[0]}: exists, and is never overwritten; name another file by --out")
     print(
         f"{schedule.title}: {schedules.span(schedule.duration_s)}, {len(schedule.commands())} moves, "
         f"{schedule.setpoint_um.min():g} to {schedule.setpoint_um.max():g} um"
@@ -99,6 +102,11 @@ def _progress(path: Path) -> Path:
     return path.with_name(path.name + ".progress")
 
 
+def _note(path: Path, done_s: list[float]) -> None:
+    """Write the time reached, for --resume."""
+    write_text(_progress(path), f"{done_s[0]:.3f}\n")
+
+
 def _reached(path: Path) -> float:
     """Return the time, s, that an unfinished recording reached. Raises InputError for a damaged file."""
     text = _progress(path).read_text(errors="replace")
@@ -117,6 +125,7 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
     """Run a schedule and write the rows; no signal ends it before they are written."""
     earlier, at_s = None, 0.0
     if resume and _progress(path).exists():
+        recover(path)
         earlier, at_s = drive.earlier_part(rig, path, _reached(path), print)
     keyboard = Keyboard(sys.stdin.isatty() and sys.stderr.isatty())
     blocks: list[np.ndarray] = []
@@ -128,10 +137,12 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
         if sys.stderr.isatty():
             print(f"\r{p.percent:5.1f} %  {p.eta_s:6.0f} s left", end="", file=sys.stderr, flush=True)
 
+    note = functools.partial(_note, path, done_s)
     ended = ""
     with keyboard.listening():
         try:
-            for block in rig.run(schedule, show, keyboard, earlier, at_s):
+            run = rig.run(schedule, show, keyboard, earlier, at_s)
+            for block in kept(run, path, rig.settings.row, note):
                 blocks.append(block)
         except experiments.Aborted as e:
             ended = e.reason
@@ -139,7 +150,8 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
             rows = np.vstack(blocks)
             _write(path, as_table(rows, path, rig.settings.row))
         if ended:
-            write_text(_progress(path), f"{done_s[0]:.3f}\n")
+            note()
+        stream_of(path).unlink(missing_ok=True)
     if blocks:
         print(f"{path}: {len(rows)} rows")
     if not ended:
@@ -150,4 +162,4 @@ def _record(rig: drive.DrivenRig, schedule: experiments.Schedule, path: Path, re
         f"go on with --resume --out {path}",
         file=sys.stderr,
     )
-    return ENDED
+    return STATUS if keyboard.ended else ENDED

@@ -1,23 +1,34 @@
 """Recordings of a test.
 
-Rows as the loop records them, a table of them, and the signals of a calibration at 1 s."""
+Rows as the loop records them, a table of them, and the signals of a calibration at 1 s. The rows of a test
+that runs are on the disk, too: kill -9 or a power cut costs at most the last KEEP_S of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from thermoctl.control import faults
+from thermoctl.files.safe_file import WriteError, reason
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.files import read_table
+from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
+from thermoctl.recording.writer import StreamFile, schema
 from thermoctl.rig.signals import AT, Row, fault_word
 
 EVERY_RIG = ("power_w", "air_c", "output_reference_um", "position_raw_um", "setpoint_um")
 """Signals of a calibration, besides the points' temperatures."""
+KEEP_S = 1.0
+"""Wall time between two writes of the rows of a running test.
+
+A block of rows, 100 s of a simulated rig, is written at once."""
 SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
 
 
@@ -101,3 +112,50 @@ def causes(row: np.ndarray) -> str:
     Without any fault, a user disarmed the rig."""
     tripping = [f for f in faults.decode(fault_word(row)) if f.severity != "warning"]
     return "; ".join(f"{f.name}: {f.meaning} -> {f.remedy}" for f in tripping) or "somebody disarmed it"
+
+
+def stream_of(path: Path) -> Path:
+    """Return the stream that holds the rows of a test until its file `path` is written."""
+    return path.with_name(path.name + ".running.arrows")
+
+
+def kept(
+    blocks: Iterable[np.ndarray], path: Path, layout: Row, note: Callable[[], None]
+) -> Iterator[np.ndarray]:
+    """Yield the blocks of a test, and write them to its stream. note: saves the time that the test reached.
+
+    A disk that refuses does not end the test; the rows are then in memory only, and a line reports it."""
+    waiting: list[np.ndarray] = []
+    stream: StreamFile | None = None
+    written_s = time.monotonic()
+    try:
+        for block in blocks:
+            waiting.append(block)
+            if time.monotonic() - written_s >= KEEP_S:
+                try:
+                    note()
+                    stream = stream or StreamFile(stream_of(path), schema(layout.signals, {}))
+                    stream.write(np.vstack(waiting))
+                    written_s, waiting = time.monotonic(), []
+                except (OSError, WriteError) as e:
+                    written_s = math.inf
+                    why = e.why if isinstance(e, WriteError) else f"{stream_of(path)}: {reason(e)}"
+                    print(f"thermoctl: {why}; the test goes on, its rows are in memory only", file=sys.stderr)
+            yield block
+    finally:
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.close()
+
+
+def recover(path: Path) -> None:
+    """Write the rows of a test that was killed to its file `path`. Raises InputError."""
+    stream = stream_of(path)
+    if stream.exists():
+        try:
+            rows: Table | None = read_table(stream)
+        except InputError:  # killed before the first row
+            rows = None
+        if rows is not None:
+            write_table(path, rows)
+        stream.unlink()

@@ -20,6 +20,7 @@ from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import tuning
 from thermoctl.identify.measured_loop import Measured, Timing, disagreement, measure
 from thermoctl.identify.tuning import Gains, SecondOrder
+from thermoctl.interrupt import Interrupted
 from thermoctl.rig.option import TRIAL_FACTOR
 from thermoctl.rig.signals import AT
 from thermoctl_hal.base.backend import HardwareError
@@ -101,8 +102,8 @@ def _prove(
         where = f"step {k} of {len(steps)} (kp {gains.kp:.4g}, ti_s {gains.ti_s:.4g}, td_s {gains.td_s:.4g})"
         try:
             rows, _ = _test(rig, keyboard, gains, DIVERGES * error_um)
-        except (InputError, HardwareError) as e:
-            kind = type(e) if isinstance(e, InputError) else HardwareError
+        except (InputError, HardwareError, Interrupted) as e:
+            kind = HardwareError if isinstance(e, HardwareError) else type(e)
             raise kind(f"{where}: {e}; the gains of before are in force, nothing was written") from None
         measured = measure(rows, models[0], gains, period_s, average)
         if contradiction := disagreement(measured, models, gains, period_s, average):

@@ -28,7 +28,7 @@ import numpy as np
 
 from thermoctl.calibration import drive, steps
 from thermoctl.calibration.keyboard import Keyboard
-from thermoctl.calibration.recorded import as_table
+from thermoctl.calibration.recorded import as_table, kept, recover, stream_of
 from thermoctl.calibration.report import report
 from thermoctl.calibration.schedules import of_config, span
 from thermoctl.calibration.simulated_rig import SimulatedRig
@@ -160,6 +160,7 @@ class Wizard:
         """Run a test to its end; return False if it was interrupted: a new call continues from there."""
         schedule, part = self.tests[name], self.folder / f"{name}.part.parquet"
         earlier, at_s = None, 0.0
+        recover(part)
         if name in self.at_s:
             earlier, at_s = drive.earlier_part(
                 self.rig, part, self.at_s[name], lambda line: self.say(f"   {name} {line}")
@@ -168,12 +169,25 @@ class Wizard:
         left_s = sum(
             self.tests[n].duration_s for n in STEPS[number:] if n in self.tests and n not in self.done
         )
-        show = _progress_line(lambda p: self._time_left(p, left_s))
+        progress_line = _progress_line(lambda p: self._time_left(p, left_s))
+        done_s = [at_s]
+
+        def show(p: Progress) -> None:
+            """Keep the time reached, s, and show it."""
+            done_s[0] = p.done_s
+            progress_line(p)
+
+        def note() -> None:
+            """Save the time reached, for the next call."""
+            self.at_s[name] = done_s[0]
+            self._save()
+
         acting = name == "test_4b" and isinstance(self.rig, SimulatedRig)
         model = modelfile.load_model(self._model_path) if acting else None
         blocks, ended, started = [], None, time.monotonic()
         try:
-            for block in self.rig.run(schedule, show, keyboard, earlier, at_s, model):
+            run = self.rig.run(schedule, show, keyboard, earlier, at_s, model)
+            for block in kept(run, part, self.settings.row, note):
                 blocks.append(block)
         except Aborted as e:
             ended = e
@@ -182,6 +196,7 @@ class Wizard:
         print(file=sys.stderr)
         if blocks:
             write_table(part, as_table(np.vstack(blocks), part, self.settings.row))
+        stream_of(part).unlink(missing_ok=True)
         if ended is not None:
             self.at_s[name] = ended.done_s
             self._save()

@@ -16,6 +16,7 @@ from thermoctl.command import AXIS
 from thermoctl.configuration import which_rig
 from thermoctl.extras import lacking
 from thermoctl.files.yamlfile import InputError
+from thermoctl.interrupt import STATUS, raise_on_signals
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     # Set before numpy is loaded: BLAS threads on busy cores wait for each other.
@@ -26,7 +27,8 @@ Holds the output of a precision linear actuator in place while its coil heats up
 lacks when it disagrees with a recording.
 
 Exit status: 0 done; 1 the answer is no (a check failed, the daemon is not running, a fault is active); 2 unusable input
-(one line on stderr says what, where, what was expected); 3 the hardware or the system refused; 130 interrupted."""
+(one line on stderr says what, where, what was expected); 3 the hardware or the system refused; 130 ended by Ctrl-C or a
+signal."""
 _NAME_WIDTH = 14  # columns of a command's name in `thermoctl --help`
 _WIDTH = 110
 
@@ -130,9 +132,10 @@ def _spare_inputs(args: argparse.Namespace) -> None:
 
 
 def _words() -> list[str]:
-    """Return the words of the command line; in a locale that is not UTF-8 start again in UTF-8 mode.
+    """Return the words of the command line; from here on a signal raises Interrupted.
 
-    Our files are UTF-8 in every locale."""
+    In a locale that is not UTF-8 start again in UTF-8 mode: our files are UTF-8 in every locale."""
+    raise_on_signals()
     if sys.getfilesystemencoding() != "utf-8":
         os.execv(sys.executable, [sys.executable, "-P", "-X", "utf8", "-m", "thermoctl", *sys.argv[1:]])
     return sys.argv[1:]
@@ -157,8 +160,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if e.filename is None:  # stdout: the rest of its buffer must not fail once more at the end
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 3
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as e:
+        print(f"thermoctl: {args.row.name}: {e or 'interrupted'}", file=sys.stderr)
+        return STATUS
     except ModuleNotFoundError as e:
         if (line := lacking(e)) is None:
             raise

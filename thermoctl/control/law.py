@@ -738,7 +738,10 @@ class Law:
                     or abs(self.power_w) > self.p.idle_power_w
                 )
             )
-            self.idle_s = self.idle_s + self.dt if driven else 0.0
+            # Counted down where there is none, so that a current that comes and goes counts, too.
+            self.idle_s = (
+                min(self.idle_s, self.p.idle_s) + self.dt if driven else max(0.0, self.idle_s - self.dt)
+            )
             if self.idle_s > self.p.idle_s:
                 found |= one << _B_STUCK
         if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.p.coil_limit_c:

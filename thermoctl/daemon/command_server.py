@@ -290,16 +290,19 @@ class _Client:
         self.holds = False
 
 
+def check_place(path: Path) -> None:
+    """Raise InputError where a file that is no socket is at the socket's path."""
+    if path.exists() and not path.is_socket():
+        raise InputError(f"{path}: a file that is no socket is there, and is kept; give another socket.path")
+
+
 def listen(path: Path, group: str | None) -> socket.socket:
     """Return a listening socket at `path`, for owner and group.
 
     Raises InputError where it cannot be made."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not path.is_socket():
-            raise InputError(
-                f"{path}: a file that is no socket is there, and is kept; give another socket.path"
-            )
+        check_place(path)
         path.unlink(missing_ok=True)
     except OSError as e:
         raise InputError(f"{path}: cannot listen: {e.strerror}; check socket.path") from None

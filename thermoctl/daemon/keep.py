@@ -53,15 +53,8 @@ def save(path: Path, model: CompensatorModel, state: np.ndarray) -> Path:
     """Save a law's snapshot; return the file.
 
     Raises WriteError when the disk refuses: the next start is cold."""
-    text = json.dumps(
-        {
-            "version": 1,
-            "boot": _boot(),
-            "at_s": _now_s(),
-            "model": _fingerprint(model),
-            "state": encode(state),
-        }
-    )
+    saved = {"version": 2, "boot": _boot(), "at_s": _now_s(), "model": _fingerprint(model)}
+    text = json.dumps({**saved, "state": encode(state), "crc": zlib.crc32(state.tobytes())})
     write_text(path, text, sync=False)  # not used after a power cut: it is of another boot
     return path
 
@@ -73,11 +66,13 @@ def load(path: Path, model: CompensatorModel) -> tuple[np.ndarray | None, float,
             data = file.read(MAX_BYTES + 1)
         saved = json.loads(data) if len(data) <= MAX_BYTES else {}
         age_s = _now_s() - float(saved["at_s"])
-        if saved["version"] != 1 or saved["boot"] != _boot() or not 0.0 <= age_s <= KEEP_S:
+        if saved["version"] != 2 or saved["boot"] != _boot() or not 0.0 <= age_s <= KEEP_S:
             return None, 0.0, f"older than {KEEP_S:g} s or of another boot"
         if saved["model"] != _fingerprint(model):
             return None, 0.0, "of another model"
         state = decode(saved["state"])
+        if saved["crc"] != zlib.crc32(state.tobytes()):
+            return None, 0.0, f"{path} is damaged"
         return (state, age_s, "") if np.isfinite(state).all() else (None, 0.0, "not finite")
     except FileNotFoundError:
         return None, 0.0, "none were kept"

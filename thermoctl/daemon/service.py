@@ -87,7 +87,7 @@ def journal(settings: Settings, size: int) -> str:
 def start(settings: Settings) -> int:
     """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
 
-    Returns 0, or 3 with the daemon's own error."""
+    Returns 0, or 3 with the daemon's own error. A signal meanwhile ends the daemon, too."""
     if (pid := holder(settings)) is not None:
         print(f"already running (pid {pid}, {_state(settings)})")
         return 0
@@ -97,6 +97,20 @@ def start(settings: Settings) -> int:
         print(f"thermoctl: {unit} did not start; its log: journalctl -u {unit}", file=sys.stderr)
         return 3
     log = f"journalctl -u {unit}" if unit else str(log_path(settings))
+    with contextlib.ExitStack() as unless_up:
+        if process is not None:
+            unless_up.callback(process.end)
+        if _is_up(settings, process, log):
+            unless_up.pop_all()
+            return 0
+    if process is not None:
+        sys.stderr.write(process.said())
+    print(f"thermoctl: the daemon did not start; its log: {log}", file=sys.stderr)
+    return 3
+
+
+def _is_up(settings: Settings, process: Background | None, log: str) -> bool:
+    """Wait until the daemon takes commands, and say so; return False if it ends before or needs too long."""
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and (process is None or process.poll() is None):
         pid = holder(settings)
@@ -104,15 +118,9 @@ def start(settings: Settings) -> int:
             answers = [ask(part.socket.path, {"command": "status"}) for part in settings.parts]
             if all(map(settled, answers)) and pid is not None and (process is None or pid == process.pid):
                 print(f"started (pid {pid}, {', '.join(now['state'] for now in answers)}, log {log})")
-                return 0
+                return True
         time.sleep(0.1)
-    if process is not None:
-        if process.poll() is None:
-            process.terminate()
-            process.wait(STOP_S)
-        sys.stderr.write(process.said())
-    print(f"thermoctl: the daemon did not start; its log: {log}", file=sys.stderr)
-    return 3
+    return False
 
 
 def _state(settings: Settings) -> str:
@@ -188,6 +196,11 @@ class Background(subprocess.Popen[bytes]):
                 preexec_fn=die_with_parent if dies_with_us else None,
             )
         self.log = log
+
+    def end(self) -> None:
+        """End the daemon, if it runs."""
+        self.terminate()
+        self.wait(STOP_S)
 
     def said(self) -> str:
         """Return the lines that the started daemon wrote into its log."""

@@ -23,10 +23,12 @@ import signal
 import socket
 import time
 from functools import partial
+from pathlib import Path
 
 from thermoctl.configuration.settings import Settings
 from thermoctl.control.law import COMPILED
 from thermoctl.daemon import keep
+from thermoctl.daemon.command_server import check_place
 from thermoctl.daemon.control_socket import ask, refused_reload
 from thermoctl.daemon.journal import Log, Watcher
 from thermoctl.daemon.lock import hold, is_retaken
@@ -111,6 +113,7 @@ def run(settings: Settings, log: Log = console_log) -> int:
         raise InputError(f"{settings.path}: {line}")
     lock = hold(settings)
     for part in settings.parts:
+        check_place(Path(part.socket.path))
         compensator(part)
         law_parameters(part)
         check_mode(part)

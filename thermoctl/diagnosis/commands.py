@@ -28,6 +28,7 @@ from thermoctl.diagnosis.report.words import sentences, what_next
 from thermoctl.diagnosis.show import read
 from thermoctl.diagnosis.workers import cluster
 from thermoctl.files.yamlfile import InputError
+from thermoctl.interrupt import Interrupted
 from thermoctl.plant import load
 from thermoctl.plant.language import Plant
 from thermoctl.plant.recordings import read_recordings
@@ -123,9 +124,8 @@ def diagnose(args: argparse.Namespace) -> int:
             result = resolve(diagnosed, args.recordings, Path(args.out), args.record, args.rounds, say)
         else:
             result = diagnosed(args.recordings)
-    except KeyboardInterrupt:
-        print(f"thermoctl: stopped; {args.out} holds nothing of this diagnosis", file=sys.stderr)
-        raise
+    except KeyboardInterrupt as e:
+        raise Interrupted(f"{e or 'stopped'}; {args.out} holds nothing of this diagnosis") from None
     if args.json:
         print(json.dumps(result, indent=1, allow_nan=False))
     elif not args.quiet:

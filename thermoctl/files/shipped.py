@@ -35,6 +35,16 @@ def state_folder(config: str | Path) -> Path | None:
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "thermoctl"
 
 
+def _copy(source: Path, target: Path) -> None:
+    """Copy a folder. Raises the first OSError, where shutil.copytree raises a list of all of them."""
+    target.mkdir(parents=True)
+    for entry in source.iterdir():
+        if entry.is_dir():
+            _copy(entry, target / entry.name)
+        else:
+            shutil.copy2(entry, target / entry.name)
+
+
 def init(folder: str) -> int:
     """Copy configurations, device profiles, plants and examples into a folder.
 
@@ -45,7 +55,7 @@ def init(folder: str) -> int:
             raise InputError(f"{target}: exists already and is kept; give another folder")
     with whole_files(folder) as part:
         for source, name in COPIED.items():
-            shutil.copytree(shipped(source), part / name)
+            _copy(shipped(source), part / name)
     for name in COPIED.values():
         print(f"wrote {Path(folder) / name}")
     rig = Path(folder) / "config/rig.yaml"

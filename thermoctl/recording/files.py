@@ -92,7 +92,7 @@ def write_arrow(path: str, kind: str, arrow: pa.Table) -> None:
         if kind == ".csv":
             pa.csv.write_csv(arrow, f, pa.csv.WriteOptions(quoting_style="needed"))
         elif kind == ".parquet":
-            pa.parquet.write_table(arrow, f, compression="zstd")
+            pa.parquet.write_table(arrow, f, compression="zstd", write_page_checksum=True)
         else:
             options = pa.ipc.IpcWriteOptions(compression="zstd")
             with pa.ipc.new_file(f, arrow.schema, options=options) as writer:
@@ -319,7 +319,7 @@ def own_meta(schema: pa.Schema) -> dict[str, str]:
 
 
 def _read_parquet(path: Path, want: list[str] | None) -> Raw:
-    with pa.parquet.ParquetFile(path) as f:
+    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as f:
         names = f.schema_arrow.names
         chosen = picked(path, names, want)
         _limit(path, f.metadata.num_rows, len(chosen))

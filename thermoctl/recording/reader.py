@@ -172,7 +172,7 @@ def _export_stream(
         writer = stack.enter_context(
             pa.csv.CSVWriter(f, stream.schema)
             if kind == ".csv"
-            else pa.parquet.ParquetWriter(f, stream.schema, compression="zstd")
+            else pa.parquet.ParquetWriter(f, stream.schema, compression="zstd", write_page_checksum=True)
         )
         for piece in _pieces(stream, clock, begin_s, end_s):
             writer.write_table(piece)

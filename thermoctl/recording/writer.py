@@ -33,7 +33,7 @@ from thermoctl.rig.signals import SIGNALS, Signal
 BATCH_S = 0.5  # duration of one batch at the full rate: a power loss costs at most these ticks
 BATCH_ROWS = 4096  # most rows in one batch, for simulated time that runs faster
 TIER_HZ = 10.0
-TIER_BATCH_ROWS = 100  # 10 s; after a power loss the full rate still has these rows
+TIER_BATCH_ROWS = 50  # 5 s, less than the ring holds, for a test that goes on; the full rate has them, too
 RETRY_S = 5.0
 CHANGED = "a new file begins; let other programs change only older ones"
 FULL, TIER = ".arrows", ".10hz.arrows"

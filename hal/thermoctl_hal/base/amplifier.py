@@ -159,8 +159,7 @@ class Commanded:
     def disconnect(self: Any) -> None:
         """Disable, as far as the port still works, and close it."""
         with contextlib.suppress(OSError, HardwareError):
-            for message, command in self.sequencer.off():
-                self.send_message(message, command)
+            self._send_off()
         super().disconnect()  # type: ignore[misc]
 
     def switch_off(self: Any) -> None:
@@ -201,6 +200,19 @@ class Commanded:
         for message, command in self.sequencer.messages(drive, enable, now_s):
             self.send_message(message, command)
 
+    def _send_off(self) -> None:
+        """Send all messages that disable, also when one fails or has no valid answer.
+
+        Raises the last HardwareError or OSError then."""
+        failed: HardwareError | OSError | None = None
+        for message, command in self.sequencer.off():
+            try:
+                self.send_message(message, command)
+            except (HardwareError, OSError) as e:
+                failed = e
+        if failed is not None:
+            raise failed
+
     def confirm_off(self, read: Callable[[], None]) -> None:
         """Disable, and wait until the amplifier reports that it is off. read: takes what has arrived.
 
@@ -211,8 +223,7 @@ class Commanded:
             now_s = time.monotonic()
             if now_s >= again:
                 again = now_s + REPEAT_S
-                for message, command in self.sequencer.off():
-                    self.send_message(message, command)
+                self._send_off()
             if self.is_assumed:
                 return
             read()

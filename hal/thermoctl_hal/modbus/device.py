@@ -330,22 +330,25 @@ class ModbusDrive(Commanded, ModbusDevice):
     """An amplifier whose registers take the command (DAC, servo drive); its poller writes them."""
 
     def send_message(self, message: Message, command: float) -> None:
-        """Write a register. Raises HardwareError when the unit refuses it or does not answer."""
+        """Write a register, again while the unit is busy.
+
+        Raises HardwareError when the unit refuses it or does not answer."""
         m = typed(message, RegisterMessage)
         if self._link is None:
             raise HardwareError("not connected")
         value = clipped(command if m.value is None else m.value, m.register)
         where = f"{self.binding.port}: writing {m.register.kind} {m.register.address}"
-        try:
-            code = self._link.write(
-                m.function,
-                m.register.address,
-                encode(value, m.register),
-                self.binding.address,
-                self._spec.timeout_s,
-            )
-        except NoAnswer as e:
-            raise HardwareError(f"{where}: {e}") from None
+        words, code = encode(value, m.register), 0
+        for _ in range(BUSY_TRIES):
+            try:
+                code = self._link.write(
+                    m.function, m.register.address, words, self.binding.address, self._spec.timeout_s
+                )
+            except NoAnswer as e:
+                raise HardwareError(f"{where}: {e}") from None
+            if code not in BUSY:
+                break
+            time.sleep(BUSY_PAUSE_S)
         if code:
             name, remedy = EXCEPTIONS.get(code, ("unknown", "see the device's manual"))
             raise HardwareError(f"{where}: exception {code} ({name}): {remedy}")

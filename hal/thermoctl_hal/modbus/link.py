@@ -12,9 +12,10 @@ send beside an answer, so connections are ours.
 Bytes that arrived before a request, such as a late answer, are dropped. An answer on a serial line does not
 name its register. So after a lost answer a unit is asked for an echo (function 8) first. Units answer in
 order: everything before the echo is late. A server that closes the connection after an answer is connected
-again for the next request. One that is silent after connecting gets more time at each connection. On a serial
-line the echo of the request and bytes before the answer are passed over. Behind the request of another master
-comes its answer, which may be to another register: no answer is taken from there on.
+again for the next request. One that is silent after connecting gets more time at each connection, before the
+first reading; a command never waits for that. On a serial line the echo of the request and bytes before the
+answer are passed over. Behind the request of another master comes its answer, which may be to another
+register: no answer is taken from there on.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ READ_SIZE = 8  # bytes of an RTU request for registers or bits
 OTHERS_S = 0.1  # time in which a unit answers another master
 HEAD, LONGEST_PDU = 7, 253  # bytes of a TCP frame before its PDU, and of the longest PDU
 SETTLE_S = (0.0, 1.0, 3.0, 6.0, 10.0)
-"""Pause between connecting and the first request: one step more after each connection that gave no answer."""
+"""Pause between connecting and the first reading: one step more after each connection that gave no answer."""
 GAP_CHARACTERS, GAP_MIN_S = 3.5, 1.75e-3  # silence between two RTU frames
 LOOK_S = 0.005  # time between two looks whether another device has to be served
 CHUNK = 4096
@@ -117,6 +118,7 @@ class Link:
         self._echoes = False  # does the line send our own bytes back?
         self._answered = False
         self._free_s = 0.0  # time from which the next RTU frame may begin
+        self._settled_s = 0.0  # time from which the first reading may begin
         self._lost: set[tuple[int, int]] = set()  # unit and function of reads without an answer in time
         self._late: dict[int, _Echo] = {}  # by unit: function 8 was sent, its answer is waited for
         self._is_rtu = port.startswith("rtu:")
@@ -131,7 +133,7 @@ class Link:
             )
         self._open(timeout_s)
         if self._network is not None:
-            self._free_s += SETTLE_S[_SILENT.get(port, 0)]
+            self._settled_s = self._free_s + SETTLE_S[_SILENT.get(port, 0)]
 
     def _open(self, timeout_s: float) -> None:
         """Open the port. Raises HardwareError."""
@@ -198,7 +200,7 @@ class Link:
                 self.broken = True
                 self._line.close()
                 raise HardwareError(f"{self.port}: the connection is gone ({e})") from None
-            self._answered = True
+            self._answered, self._settled_s = True, 0.0
             _SILENT.pop(self.port, None)
             return answer
 
@@ -224,6 +226,7 @@ class Link:
         key = request.unit, request.function
         if key in self._lost:
             self._catch_up(request, timeout_s)
+        self._settle(request)
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self._drop()
         end = time.monotonic() + timeout_s
@@ -239,6 +242,13 @@ class Link:
         if self._is_rtu and request.function in FUNCTIONS.values():
             self._lost.add(key)
         raise NoAnswer(self._why(received, request, timeout_s))
+
+    def _settle(self, request: _Request) -> None:
+        """Wait before the first reading from a silent server. Raises NoAnswer when it `is_urgent`."""
+        while request.function in FUNCTIONS.values() and time.monotonic() < self._settled_s:
+            if self.is_urgent():
+                raise NoAnswer("broken off: another device is served, or the program ends")
+            time.sleep(LOOK_S)
 
     def _arrives(self, request: _Request, end_s: float) -> bool:
         """Wait for bytes until `end_s`; a reading waits no longer when it `is_urgent`."""

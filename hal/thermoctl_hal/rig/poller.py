@@ -17,6 +17,7 @@ from thermoctl_hal.base.profile import Assumed
 from thermoctl_hal.rig.board import Board
 
 RECONNECT_S = 0.25  # time between attempts to open a device that is gone
+END_S = 1.0  # after this time a process that drives nothing waits for no device any more
 COMMAND_AGE_S = 0.25  # an amplifier is disabled when the loop's last command is older
 
 
@@ -51,7 +52,8 @@ def poll_until(devices: list[Device], board: Board, stop: threading.Event) -> No
     due_s = dict.fromkeys(devices, time.monotonic())
     for device in devices:
         samples[device].status[device.roles] = STALE
-        device.is_urgent = partial(_any, is_withdrawn, [d for d in enabled if d is not device])
+        others = [d for d in enabled if d is not device]
+        device.is_urgent = partial(_is_urgent, stop, is_withdrawn, others)
     while not stop.is_set():
         device = min(devices, key=lambda d: (not is_first(d), due_s[d]))
         if not is_first(device) and stop.wait(max(0.0, due_s[device] - time.monotonic())):
@@ -66,6 +68,7 @@ def poll_until(devices: list[Device], board: Board, stop: threading.Event) -> No
         due_s[device] += period_s[device] if device.up else RECONNECT_S
         due_s[device] = max(due_s[device], time.monotonic())  # a slow answer: drop the polls that were missed
     for device in devices:
+        device.is_urgent = lambda: False  # the state of an amplifier is read below
         if device.drives and not device.up:
             with contextlib.suppress(HardwareError, OSError):
                 device.switch_off()
@@ -79,8 +82,8 @@ def _rate_hz(device: Device) -> float:
     return max(rates + ([amplifier.command_hz] if amplifier is not None else []))
 
 
-def _any(is_so: Callable[[Device], bool], devices: list[Device]) -> bool:
-    return any(map(is_so, devices))
+def _is_urgent(stop: threading.Event, is_withdrawn: Callable[[Device], bool], others: list[Device]) -> bool:
+    return stop.is_set() or any(map(is_withdrawn, others))
 
 
 def _command(device: Device, board: Board) -> tuple[float, bool]:
@@ -116,15 +119,19 @@ def run_poller(devices: list[Device], board_name: str) -> None:
     """Run a poller process for the devices of a port, until SIGTERM or until the parent is gone."""
     board = Board.attach(board_name)
     stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    # A thread takes SIGTERM: a handler could interrupt `stop` itself, and wait for good for its lock.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the group; the supervisor stops us
     parent = os.getppid()
 
-    def watch_parent() -> None:
-        """Set `stop` within 0.5 s after the parent process has ended."""
-        while not stop.wait(0.5):
-            if os.getppid() != parent:
-                stop.set()
+    def watch() -> None:
+        """Set `stop` at SIGTERM, or within 0.5 s after the parent has ended; then see that this one ends."""
+        while signal.sigtimedwait([signal.SIGTERM], 0.5) is None and os.getppid() == parent:
+            pass
+        stop.set()
+        if not any(d.drives for d in devices):
+            time.sleep(END_S)
+            os._exit(0)  # still waiting for a host: to connect, or for its name
 
-    threading.Thread(target=watch_parent, daemon=True).start()
+    threading.Thread(target=watch, daemon=True).start()
     poll_until(devices, board, stop)

@@ -35,6 +35,7 @@ from thermoctl.daemon.views.watch import Watch
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.shipped import state_folder
 from thermoctl.files.yamlfile import InputError
+from thermoctl.interrupt import SIGNALS
 
 MOTION, CYCLE_S = ((0.0, 240.0), (70.0, 200.0)), 90.0
 """Corners (s in the cycle, setpoint um). 240 um need 0.78 A and 2.9 W: +2 um of shaft in a minute."""
@@ -55,16 +56,17 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
             "for it: `thermoctl run` or `start`, then `thermoctl arm`; for the demo: --config config/simulated.yaml"
         )
     own = _own(settings)
-    with _stopped_by_signals():
-        show = _Demo(own, Console())
-        try:
-            return show.run(seconds)
-        except KeyboardInterrupt:
-            return 0
-        finally:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
-            show.close()
+    show = _Demo(own, Console())
+    try:
+        return show.run(seconds)
+    except KeyboardInterrupt:
+        if not show.was_ready:
+            raise
+        return 0
+    finally:
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
+        show.close()
 
 
 def demo_folder(settings: Settings) -> Path:
@@ -96,30 +98,6 @@ def _own(settings: Settings) -> Any:
     path = folder / "rig.yaml"
     write_text(path, f"# Written by `thermoctl demo` from {settings.path}.\n{effective(own)}")
     return load_settings(path)
-
-
-class Interrupted(KeyboardInterrupt):
-    """A signal that ends the demo.
-
-    A KeyboardInterrupt may leave code that is executed from a string: so data classes are made in an import.
-    Python remembers that, and ends by SIGINT, though the exception was caught."""
-
-
-@contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the demo as Ctrl-C does."""
-
-    def interrupt(*_: Any) -> None:
-        """Raise Interrupted, which ends the demo as KeyboardInterrupt would."""
-        raise Interrupted
-
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {n: signal.signal(n, interrupt) for n in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class _Demo:

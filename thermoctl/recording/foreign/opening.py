@@ -155,12 +155,17 @@ def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     return sheets
 
 
+def _parquet(path: Path, how: How, notes: list[str]) -> list[Sheet]:
+    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as f:
+        return [formats.read_arrow(path, f.read())]
+
+
 _READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {
     "hdf": lambda path, how, notes: read_hdf(path, notes, how.sheet),
     "mdf": lambda path, how, notes: formats.read_mdf(path, notes),
     "tdms": lambda path, how, notes: formats.read_tdms(path, notes, how.sheet),
     "mat": lambda path, how, notes: formats.read_mat(path, notes, how.sheet),
-    "parquet": lambda path, how, notes: [formats.read_arrow(path, pa.parquet.ParquetFile(path).read())],
+    "parquet": _parquet,
     "arrow": _arrow,
     "excel": _excel,
 }

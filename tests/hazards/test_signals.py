@@ -1,0 +1,141 @@
+"""Signals in the middle of a command: one line, status 130, no half file, the recorded rows kept.
+
+kill -9 of a test: what its stream on the disk lacks, and that the test goes on.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tests.daemon.process import Daemon, patient, wait
+from tests.hazards.harness import ROWS, Row
+from tests.simulated import ROOT, rig_file
+from thermoctl.configuration.settings import load_settings
+from thermoctl.daemon.lock import holder
+from thermoctl.recording.files import read_table
+
+HEATER = ROOT / "docs/examples/heater"
+COMMANDS = {
+    "experiment": (
+        ["experiment", "test_1", "--config", "rig.yaml", "--out", "test.parquet"],
+        "moves the output",
+        "the amplifier is disabled: stopped on request; go on with --resume --out test.parquet",
+    ),
+    "calibrate": (
+        ["calibrate", "--config", "rig.yaml", "--out", "cal"],
+        " test_1: ",
+        "the same command goes on",
+    ),
+    "tune": (["tune", "--config", "rig.yaml", "--write"], "response: ", "thermoctl: tune: "),
+    "diagnose": (
+        ["diagnose", "--plant", HEATER / "plant.yaml", HEATER / "run_1.csv", "--out", "out"],
+        "searching",
+        "thermoctl: diagnose: ended by SIGTERM; out holds nothing of this diagnosis",
+    ),
+    "export": (
+        ["recordings", "export", "long.parquet", "long.csv"],
+        "",
+        "thermoctl: recordings export: ended by SIGTERM",
+    ),
+    "start": (["start", "--config", "rig.yaml"], "", "thermoctl: start: ended by SIGTERM"),
+}
+"""Words of each command, what it prints before the signal ('': see `is_begun`), and its last line."""
+
+
+EXPERIMENT = """format: thermoctl-experiments/1
+rate_um_s: 16.6667
+experiments:
+  short: {title: Up and down, parts: [{hold: [[1, 0], [6, 20], [3, 0]]}]}
+"""
+
+
+def command(folder, out, *words):
+    """Start a command in a folder; what it prints goes to `out`."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "thermoctl.cli", *map(str, words)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/hal", "PYTHONUNBUFFERED": "1"},
+        stdin=subprocess.DEVNULL,
+        stdout=out,
+        stderr=out,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    rig_file(tmp_path)
+    (tmp_path / "experiments.yaml").write_bytes((ROOT / "config/experiments.yaml").read_bytes())
+    rows = np.arange(600_000)
+    columns = {"t_s": rows * 1e-3, **{f"a{k}": np.sin(rows + k) for k in range(12)}}
+    pq.write_table(pa.table(columns), tmp_path / "long.parquet")
+    return tmp_path
+
+
+def is_begun(name, folder, said):
+    """Return whether a command is at work."""
+    if name == "export":
+        return any(folder.glob(".long.csv.*.part"))
+    if name == "start":
+        return any(folder.glob("*.log"))
+    return COMMANDS[name][1] in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_signal_ends_a_command(folder, name, number):
+    if name == "diagnose" and number == signal.SIGINT:
+        pytest.skip("the first Ctrl-C ends the search with the result so far, see tests/diagnose")
+    words, _, line = COMMANDS[name]
+    log = folder / "said"
+    with log.open("w") as out:
+        process = command(folder, out, *words)
+    wait(lambda: is_begun(name, folder, log.read_text()), name)
+    process.send_signal(number)
+    assert process.wait(60) == 130, log.read_text()
+    said = log.read_text()
+    assert line.replace("SIGTERM", number.name) in said.splitlines()[-1] and "Traceback" not in said, said
+    assert not [*folder.glob(".*.part"), *folder.glob("long.csv"), *folder.glob("out")]
+    assert holder(load_settings(folder / "rig.yaml")) is None
+    if name == "experiment":
+        assert len(read_table(folder / "test.parquet")) > 0
+    if name == "calibrate":
+        reached_s = json.loads((folder / "cal/state.json").read_text())["at_s"]["test_1"]
+        assert read_table(folder / "cal/test_1.part.parquet").t[-1] >= reached_s - 1.0
+
+
+def test_kill_9_of_a_test_costs_a_second_of_rows_and_it_goes_on(tmp_path):
+    config, out = patient(rig_file(tmp_path)), tmp_path / "short.parquet"
+    (tmp_path / "experiments.yaml").write_text(EXPERIMENT)
+    words = "experiment", "short", "--config", config, "--out", out, "--resume", "--yes"
+    stream = out.with_name("short.parquet.running.arrows")
+    daemon = Daemon(config)
+    try:
+        process = command(tmp_path, subprocess.DEVNULL, *words)
+        wait(lambda: stream.exists() and len(read_table(stream)) > 20, "rows on the disk")
+        process.kill()
+        process.wait()
+        killed_s = time.time()
+        lost_s = killed_s - read_table(stream).columns["wall_s"][-1]
+        assert lost_s < 2.0  # 1 s, and the rows of the last look
+        wait(lambda: daemon.ask("status")["state"] == "READY", "disarmed")
+        with (tmp_path / "said").open("w") as said:
+            assert command(tmp_path, said, *words).wait(120) == 0
+        assert "goes on at" in (tmp_path / "said").read_text()
+        whole = read_table(out)
+        assert np.diff(whole.t).max() < 2.0 and whole.columns["wall_s"][0] < killed_s
+        assert [p.name for p in tmp_path.glob("short*")] == ["short.parquet"]
+        measured = f"{lost_s:.2f} s of its rows lost"
+        ROWS.append(
+            Row("Processes", "kill -9: experiment", "2 s of rows", measured, "amplifier off; goes on", "")
+        )
+    finally:
+        daemon.kill()

@@ -1,0 +1,33 @@
+"""Ctrl-C, SIGTERM and a closed terminal end a command by one exception: one line and one exit status."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+STATUS = 130
+"""Exit status of a command that was ended by a signal."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends the command; its text is the line for the user.
+
+    A KeyboardInterrupt may leave code that is executed from a string: so data classes are made in an import.
+    Python remembers that, and ends by SIGINT, though the exception was caught."""
+
+
+def raise_on_signals() -> None:
+    """Let each of SIGNALS that is not ignored raise Interrupted; processes forked later end as usual."""
+    pid = os.getpid()
+
+    def end(number: int, _: object) -> None:
+        """Raise Interrupted, in this process only."""
+        if os.getpid() == pid:
+            raise Interrupted(f"ended by {signal.Signals(number).name}")
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
+
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
