@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+from collections.abc import Iterator
 
 STATUS = 130
 """Exit status of a command that was ended by a signal."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+_held: list[list[str]] = []  # signals that came within each `held`
 
 
 class Interrupted(KeyboardInterrupt):
@@ -24,10 +29,26 @@ def raise_on_signals() -> None:
     def end(number: int, _: object) -> None:
         """Raise Interrupted, in this process only."""
         if os.getpid() == pid:
-            raise Interrupted(f"ended by {signal.Signals(number).name}")
+            text = f"ended by {signal.Signals(number).name}"
+            if not _held:
+                raise Interrupted(text)
+            _held[-1].append(text)
+            return
         signal.signal(number, signal.SIG_DFL)
         signal.raise_signal(number)
 
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, end)
+
+
+@contextlib.contextmanager
+def held() -> Iterator[None]:
+    """Let signals wait until the block has ended: one in it would lose a process that it starts."""
+    _held.append([])
+    try:
+        yield
+    finally:
+        came = _held.pop()
+    if came:
+        raise Interrupted(came[0])

@@ -112,6 +112,24 @@ def test_a_signal_ends_a_command(folder, name, number):
         assert read_table(folder / "cal/test_1.part.parquet").t[-1] >= reached_s - 1.0
 
 
+HELD = """
+import os, signal, thermoctl.interrupt as i
+i.raise_on_signals()
+try:
+    with i.held():
+        os.kill(os.getpid(), signal.SIGTERM)
+        print("process known")
+except i.Interrupted as e:
+    print(e)
+"""
+
+
+def test_a_signal_waits_until_a_process_that_starts_is_known():
+    """`start` that was ended right after it had made the daemon left it running."""
+    done = subprocess.run([sys.executable, "-c", HELD], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.splitlines() == ["process known", "ended by SIGTERM"]
+
+
 def test_kill_9_of_a_test_costs_a_second_of_rows_and_it_goes_on(tmp_path):
     config, out = patient(rig_file(tmp_path)), tmp_path / "short.parquet"
     (tmp_path / "experiments.yaml").write_text(EXPERIMENT)

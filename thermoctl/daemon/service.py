@@ -24,6 +24,7 @@ from thermoctl.daemon.tick.loop import die_with_parent
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.shipped import shipped
 from thermoctl.files.yamlfile import InputError
+from thermoctl.interrupt import held
 
 START_S = 90.0  # as TimeoutStartSec= of the unit: devices connect before the first tick
 STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills them
@@ -91,15 +92,16 @@ def start(settings: Settings) -> int:
     if (pid := holder(settings)) is not None:
         print(f"already running (pid {pid}, {_state(settings)})")
         return 0
-    unit = _unit_for(settings)
-    process = None if unit else Background(settings)
+    unit, process = _unit_for(settings), None
     if unit and _systemctl("start", unit):
         print(f"thermoctl: {unit} did not start; its log: journalctl -u {unit}", file=sys.stderr)
         return 3
     log = f"journalctl -u {unit}" if unit else str(log_path(settings))
     with contextlib.ExitStack() as unless_up:
-        if process is not None:
-            unless_up.callback(process.end)
+        if not unit:
+            with held():
+                process = Background(settings)
+                unless_up.callback(process.end)
         if _is_up(settings, process, log):
             unless_up.pop_all()
             return 0
