@@ -23,7 +23,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 def raise_on_signals() -> None:
-    """Let each of SIGNALS that is not ignored raise Interrupted; processes forked later end as usual."""
+    """Let each of SIGNALS raise Interrupted; processes forked later end as usual.
+
+    nohup and a shell's background ignore SIGHUP and SIGINT; they stay ignored."""
     pid = os.getpid()
 
     def end(number: int, _: object) -> None:
@@ -38,7 +40,7 @@ def raise_on_signals() -> None:
         signal.raise_signal(number)
 
     for number in SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:
+        if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, end)
 
 

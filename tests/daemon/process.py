@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +17,11 @@ from thermoctl.daemon.tick.assemble import shared_name
 from thermoctl.files.yamlfile import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
+for _number in (signal.SIGINT, signal.SIGHUP):
+    # a shell's background and nohup ignore them: what a test starts would inherit that
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, signal.SIG_DFL)
+
 LIMIT_S = 120.0
 
 

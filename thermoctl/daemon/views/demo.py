@@ -64,9 +64,10 @@ def demo(settings: Settings, seconds: float | None = None) -> int:
             raise
         return 0
     finally:
-        for number in SIGNALS:
-            signal.signal(number, signal.SIG_IGN)  # shutting down must not be interrupted
+        before = {n: signal.signal(n, signal.SIG_IGN) for n in SIGNALS}  # no signal interrupts the end
         show.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def demo_folder(settings: Settings) -> Path:
