@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.checks.rigs import rig
+from tests.plants import ONE_BLOCK
 from thermoctl.checks import checks
 from thermoctl.cli import main
 from thermoctl.diagnosis.diagnose import diagnose
@@ -15,30 +16,18 @@ from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
 
-PLANT = """\
-format: thermoctl-plant/1
-title: A heated block
-inputs: {heat: {unit: W}}
-parameters:
-  C: {value: 6, unit: J/K, range: [2, 14]}
-  G: {value: 0.05, unit: W/K, range: [0.015, 0.15]}
-nodes:
-  block: {unit: degC, storage: C, initial: 20, initial_sigma: 0.5}
-flows:
-  power: {into: block, rate: heat, unit: W}
-  loss: {from: block, rate: G * (block - 20), unit: W}
-outputs:
-  temperature: {value: block, unit: degC, noise: NOISE}
-"""
-
 
 def recorded(noise=0.1, stated=None, seed=1, n=1200):
     """A plant, and its recording with white noise."""
     t = np.arange(n) * 2.0
     heat = np.repeat([0.0, 3.0, 1.0, 2.0, 0.5, 2.5], n // 6)
-    real = loads(PLANT.replace("NOISE", str(noise)))
-    table = compile_plant(real).measure(Table("run_1", "run_1.csv", t, {"heat": heat}), seed)
-    return loads(PLANT.replace("NOISE", str(stated or noise))), table
+    table = Table("run_1", "run_1.csv", t, {"heat": heat, "air": np.full(n, 20.0)})
+    table = compile_plant(block(noise)).measure(table, seed)
+    return block(stated or noise), table
+
+
+def block(noise):
+    return loads(ONE_BLOCK.replace("noise: 0.1", f"noise: {noise}"))
 
 
 def changed(table, change):
@@ -155,7 +144,7 @@ def test_a_diagnosis_leaves_out_what_hangs_and_says_so_in_one_note():
 
 def test_plant_check_says_it(tmp_path, capsys):
     _, table = recorded()
-    (tmp_path / "plant.yaml").write_text(PLANT.replace("NOISE", "0.1"))
+    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
     write_table(tmp_path / "run_1.csv", changed(table, hold((610, 625))))
     files = [str(tmp_path / "plant.yaml"), "--data", str(tmp_path / "run_1.csv")]
     assert main(["plant", "check", *files]) == 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
@@ -33,22 +34,7 @@ flows:
 outputs:
   position: {value: x, unit: m, noise: 1e-4}
 """
-BLOCK = """\
-format: thermoctl-plant/1
-title: A heated block
-inputs: {heat: {unit: W}}
-parameters:
-  C: {value: 60, unit: J/K, range: [20, 140]}
-  G: {value: 0.5, unit: W/K, range: [0.15, 1.5]}
-nodes:
-  block: {unit: degC, storage: C, initial: 20, initial_sigma: 0.5}
-flows:
-  power: {into: block, rate: heat, unit: W}
-  loss: {from: block, rate: G * (block - 20), unit: W}
-outputs:
-  temperature: {value: block, unit: degC, noise: 0.05}
-"""
-RIGS = {"stage": (STAGE, "force", "position", 0.01, (-6, 6), 1e-4), "block": (BLOCK, "heat", "temperature", 4.0, (0, 20), 0.05)}  # fmt: skip
+RIGS = {"stage": (STAGE, "force", "position", 0.01, (-6, 6), 1e-4), "block": (ONE_BLOCK, "heat", "temperature", 4.0, (0, 4), 0.1)}  # fmt: skip
 
 
 def ar1(rng, rows, n):
@@ -60,13 +46,14 @@ def ar1(rng, rows, n):
 def recorded(name, rows, size, seed, more="", n=1500):
     """Two recordings of a rig whose sensor has coloured noise; `more`: a flow that the plant lacks."""
     text, drive, read, interval, (low, high), noise = RIGS[name]
-    exact = text.replace(f"noise: {noise:g}", "noise: 1e-9").replace("noise: 1e-4", "noise: 1e-9")
+    exact = text.replace("noise: 1e-4", "noise: 1e-9").replace("noise: 0.1", "noise: 1e-9")
     if "wind" in more:
-        exact = exact.replace("inputs: {", 'inputs: {wind: {unit: "1"}, ')
+        exact = exact.replace("inputs:\n", 'inputs:\n  wind: {unit: "1"}\n')
     real = compile_plant(loads(exact.replace("outputs:", f"{more}\noutputs:")))
     rng, tables = np.random.default_rng(seed), []
     for r in range(2):
         columns = {drive: np.repeat(rng.uniform(low, high, 10), n // 10), "wind": ar1(rng, 20, n)}
+        columns["air"] = np.full(n, 20.0)
         table = real.measure(Table(f"r{r}", "", np.arange(n) * interval, columns), r)
         error = ar1(rng, rows, n) if rows else rng.standard_normal(n)
         table.columns[read] = table.columns[read] + size * noise * error
@@ -115,9 +102,9 @@ def test_a_small_effect_in_coloured_noise_is_still_named():
 MISSING = {
     "friction in white noise": ("stage", 0, 1.0, FRICTION),
     "a stiffening spring in white noise": ("stage", 0, 1.0, '  hard: {from: v, rate: "2e4 * x**3", unit: N}'),
-    "a source in white noise": ("block", 0, 1.0, "  sun: {into: block, rate: 0.3 * step(t - 3000), unit: W}"),
-    "a source in coloured noise": ("block", 10, 1.0, "  sun: {into: block, rate: 0.5 * step(t - 3000), unit: W}"),
-    "random flows in white noise": ("block", 0, 1.0, "  gusts: {into: block, rate: 0.15 * wind, unit: W}"),
+    "a source in white noise": ("block", 0, 1.0, "  sun: {into: block, rate: 0.06 * step(t - 3000), unit: W}"),
+    "a source in coloured noise": ("block", 10, 1.0, "  sun: {into: block, rate: 0.1 * step(t - 3000), unit: W}"),
+    "random flows in white noise": ("block", 0, 1.0, "  gusts: {into: block, rate: 0.03 * wind, unit: W}"),
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import struct
 import threading
 import time
 
+import psutil
 import pytest
 
 from tests.daemon.process import Daemon, wait
@@ -189,7 +190,7 @@ def test_a_poller_that_drives_nothing_ends_soon(tmp_path, kind, monkeypatch):
         stack.callback(board.close)
         poller = multiprocessing.get_context("fork").Process(target=run_poller, args=([device], board.name))
         poller.start()
-        time.sleep(0.5)  # until it waits: for the connection, or before its first reading
+        wait(psutil.Process(poller.pid).net_connections, "its connection")
         begin = time.monotonic()
         poller.terminate()
         poller.join(9)

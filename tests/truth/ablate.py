@@ -139,6 +139,10 @@ RULES: Mapping[str, Rule] = {
         "a stated noise may be wrong by two standard deviations of its prior",
         {"evidence.levels.levels": _stated},
     ),
+    "coloured": Rule(
+        "a certain remainder may be the coloured noise of a sensor",
+        {"diagnose.coloured": lambda case, f, limits: []},
+    ),
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
         {"diagnose.flow_missing": lambda *a: Missing()},
@@ -179,6 +183,21 @@ RULES: Mapping[str, Rule] = {
     "its size": Rule(
         "a law that leads the hypotheses of its size is extended, though larger ones are ahead",
         {"law.contest._leading": lambda s, size: s.best},
+        searches=True,
+    ),
+    "more terms": Rule(
+        "one more term of a law competes with each effect beside it",
+        {"law.contest._more": _nothing},
+        searches=True,
+    ),
+    "rarer": Rule(
+        "a law has the odds `rare` once more where an effect at its nodes was tried in its place",
+        {"law.contest._rarer": lambda s, w: w},
+        searches=True,
+    ),
+    "answers": Rule(
+        "more outliers right after switches than by chance are answers of the plant",
+        {"data.case._without_answers": lambda odd, after: odd},
         searches=True,
     ),
     "near": Rule(

@@ -49,7 +49,7 @@ def unconverted(plant: Plant) -> Iterator[tuple[Finding, Plant]]:
             turned = replace(f, rate=ex.mul(ex.num(factor), f.rate))
             finding = _finding(plant, f"the rate of '{f.name}'", f.rate, f.unit, f.at, factor)
             yield finding, replace(plant, flows={**plant.flows, f.name: turned})
-        elif factor := _of_another_node(plant, f, sizes):
+        elif factor := _size_at_node(plant, f, sizes):
             turned = replace(f, rate=ex.mul(ex.num(factor), f.rate))
             unit = f"is stated in {f.unit}" if f.unit else f"has the unit of '{f.rate}'"
             told = f"the rate of '{f.name}' {unit}, but its node asks for storage times node per second: nothing converts it"
@@ -58,7 +58,7 @@ def unconverted(plant: Plant) -> Iterator[tuple[Finding, Plant]]:
             yield finding, replace(plant, flows={**plant.flows, f.name: turned})
 
 
-def _of_another_node(plant: Plant, f: Flow, sizes: Mapping[str, float | None]) -> float | None:
+def _size_at_node(plant: Plant, f: Flow, sizes: Mapping[str, float | None]) -> float | None:
     """Return the size of a flow's unit in that of its node; None if equal or unknown."""
     given = size_of(f.unit) if f.unit else _size(f.rate, sizes)
     for n in (plant.nodes[e] for e in (f.source, f.target) if e):

@@ -739,9 +739,7 @@ class Law:
                 )
             )
             # Counted down where there is none, so that a current that comes and goes counts, too.
-            self.idle_s = (
-                min(self.idle_s, self.p.idle_s) + self.dt if driven else max(0.0, self.idle_s - self.dt)
-            )
+            self.idle_s = max(0.0, min(self.idle_s, self.p.idle_s) + (self.dt if driven else -self.dt))
             if self.idle_s > self.p.idle_s:
                 found |= one << _B_STUCK
         if self.verdict[_COIL] == 0.0 and self.last[_COIL] > self.p.coil_limit_c:

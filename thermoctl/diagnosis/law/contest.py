@@ -58,12 +58,13 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
     s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
-    queue, known = [alone, best, *_beside_bounded(s, best)], list[Weighed]()
+    queue, known = [alone, best, *_beside_bounded(s, best)], set[Keys]()
     while queue and not case.budget.stopped():
         parent, *queue = queue
-        if parent in known or parent is not alone and only_noise(case, parent.fitted, limits):
+        keys = parent.fitted.hypothesis.keys
+        if keys in known or keys and only_noise(case, parent.fitted, limits):
             continue
-        known.append(parent)
+        known.add(keys)
         say("looking for a law")
         quiet, many = only_noise(case, s.best.fitted, limits), len(parent.fitted.hypothesis.effects)
         rivals = [s.best if quiet else _leading(s, many + k + 1) for k in range(TERMS)]
@@ -78,25 +79,29 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         say("looking for laws at two places")
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
-    s.tried = {keys: _known(s, w) for keys, w in s.tried.items()}
+    s.tried = {keys: _rarer(s, w) for keys, w in s.tried.items()}
     return searched(s)
 
 
-def _known(s: Search, w: Weighed) -> Weighed:
+def _rarer(s: Search, w: Weighed) -> Weighed:
     """Return a hypothesis; with the odds `rare` once more where an effect was tried in place of its law.
 
     Known physics at a node is likelier than an unknown law there that imitates it."""
+    if not any(_replaced(w, law, other) for law in laws_of(w.fitted) for other in s.tried.values()):
+        return w
+    return replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
+
+
+def _replaced(w: Weighed, law: PlacedLaw, other: Weighed) -> bool:
+    """Return whether another hypothesis has an effect at a law's nodes in place of the law."""
     keys = w.fitted.hypothesis.keys
-    for law in laws_of(w.fitted):
-        nodes = {*law.proposal.place.nodes}
-        for other, tried in s.tried.items():
-            if keys - other == {law.key} and len(new := other - keys) == 1:
-                (e,) = (e for e in tried.fitted.hypothesis.effects if e.key in new)
-                flow = tried.fitted.plant.flows.get(e.candidate.place.flow or "")
-                ends = {flow.source, flow.target} if flow else set()
-                if e.key[0] != LAW and nodes & {*e.candidate.place.nodes.values(), *ends}:
-                    return replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
-    return w
+    new = [e for e in other.fitted.hypothesis.effects if e.key not in keys]
+    if len(new) != 1 or isinstance(new[0], PlacedLaw) or keys - other.fitted.hypothesis.keys != {law.key}:
+        return False
+    place, flows = new[0].candidate.place, other.fitted.plant.flows
+    flow = flows.get(place.flow or "")
+    ends = {flow.source, flow.target} if flow else set()
+    return not {*law.proposal.place.nodes}.isdisjoint({*place.nodes.values(), *ends})
 
 
 def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:

@@ -131,7 +131,7 @@ def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | 
 def refits(
     case: Case, parent: Fitted, proposals: Sequence[Proposal], goal: Goal, say: Callable[[str], None]
 ) -> list[tuple[Proposal, Fitted]]:
-    """Refit the proposals that may beat the best law so far.
+    """Refit the proposals that may beat the best law so far, and return the refits that end at no bound.
 
     From the best sum, and from one with an insignificant term, the least significant term is left out. A term
     whose shape is at its upper bound gets the form that it becomes there.

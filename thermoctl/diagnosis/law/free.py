@@ -34,9 +34,8 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     Where a law fits much better than the hypothesis, a free function of a signal gains something there. At a
     velocity, products of the velocity and another signal are tried, too. Two parameters of a law are taken
     off the gain. Raises SimulationError."""
-    metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
-    linear = Tracked(metric, metric.residual, {})
-    rig = case.rig(f.rough_plant, metric.drives)
+    linear = at_refit(case, f)
+    rig = case.rig(f.rough_plant, linear.metric.drives)
     where = places_in(case, rig)
     combos = choices(case, rig, where, entered(case, f, where, NODES), linear)
     moving = [(p, v) for p, v in combos if v.drives and v.label in rig.velocities]
@@ -46,6 +45,12 @@ def pays(case: Case, f: Fitted, limits: Thresholds) -> bool:
     gains = [gain + off for gain, *_ in ranked(linear, combos)[:1]]
     gains += [gain + off - look for gain, _ in _gains(linear, products)[:1]]
     return SPREAD * max(gains, default=-np.inf) > look + unlikely(limits)
+
+
+def at_refit(case: Case, f: Fitted) -> Tracked:
+    """Return the plant linearised about its refit, without unknown flows. Raises SimulationError."""
+    metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
+    return Tracked(metric, metric.residual, {})
 
 
 def places_in(case: Case, rig: Rig) -> list[Place]:

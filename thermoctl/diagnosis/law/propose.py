@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
+from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Family, Term, combined, families, library
 from thermoctl.diagnosis.law.free import (
     NODES,
+    at_refit,
     choices,
     cost_of,
     energy,
@@ -36,7 +37,6 @@ from thermoctl.diagnosis.law.signals import Place, Signal, rates
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import chunks
-from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.shortlist import ALIKE
 from thermoctl.plant.fitting.residuals import HUGE
 
@@ -144,8 +144,7 @@ def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list
 
     `law`: at its refitted values. A law of the library is rarely exact: an effect of the catalogue must not
     explain what another form of the law does."""
-    metric = Metric(Plain(case, f.rough), as_refitted(case, f).average, True)
-    linear = Tracked(metric, metric.residual, {})
+    linear = at_refit(case, f)
     own = list(dict.fromkeys(s for t in law.terms for s in t.signals))
     out = []
     for term in _varied(_best_first(_singles(linear, law.place, own, own, frozenset()))):

@@ -3,9 +3,9 @@
 The noise of such a reading has the variance s^2 [1 - a + a A(tau)], with A the spectrum of a first-order
 process. a and tau are the likeliest of a grid, and s follows from them. A state that random flows move has
 such an error, too, but the white noise that the plant file states stays beside it. So the stated noise itself
-has to be coloured: little of it is white, and all of it is not much larger than stated. The residual over the
-root of this spectrum has to be white. It follows no signal of the plant and no other reading, and it is as
-large in each part of a recording.
+has to be coloured. Its white part is below the stated noise by a standard deviation of that one's prior. The
+whole is above it by one at most. The residual over the root of this spectrum has to be white. It follows no
+signal of the plant and no other reading, and it is as large in each part of a recording.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.limits import Thresholds
 
 SHARES = 1 - np.array([0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9])  # a
-WHITE = 0.4  # largest white part of the stated variance: beside missing physics it was 0.43 or more
 TIMES = 20  # correlation times in all recordings together, at least: of fewer, no spectrum is known
 CHANCE = 0.01  # chance of a test below which the residual is no such noise
 PARTS = 8  # number of parts of a recording, none of which may have too large a power
@@ -40,7 +39,8 @@ def coloured(case: Case, f: Fitted, limits: Thresholds) -> list[str]:
             continue
         interval = case.coordinates.channels[g.channels[0]].interval
         size, share, time = _likeliest(g, g.power(f.powers))
-        small = (1 - share) * size**2 <= WHITE * g.variance and size**2 <= g.variance * np.exp(g.known)
+        least, most = g.variance * np.exp([-g.known, g.known])
+        small = (1 - share) * size**2 <= least and size**2 <= most
         if not small or time * TIMES > g.count.sum() or min(_chances(case, f, g, size, share, time)) < CHANCE:
             return []
         white, drift = size * np.sqrt(1 - share), size * np.sqrt(share)
