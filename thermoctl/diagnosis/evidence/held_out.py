@@ -12,15 +12,15 @@ from scipy.special import stdtr
 from thermoctl.diagnosis.data.case import Case, outlier_note, without_outliers
 from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 ENOUGH = 3  # from this number of recordings on, the last one is set aside
 # Blocks of a recording; with too few recordings, every other block is fitted and the rest checked.
 BLOCKS = 16
-STARTS = 30  # largest number of runs to fit the initial states of a recording set aside
 STEPS = 2  # largest number of steps from the refit of all blocks to that of half of them
 
 
@@ -70,9 +70,18 @@ def cleaned(case: Case, null: Fitted, reserve: Sequence[Table]) -> tuple[Case, t
     model = compile_plant(null.plant)
     drives = [model.excitation(t) for t in reserve]
     errors = [errors_aside(case, null.plant, t) for t in reserve]
-    tables, wild = without_outliers(reserve, case.plant, drives, errors, errors, case.noise)
+    stated = [_as_stated(model, d) for d in drives]
+    tables, wild = without_outliers(reserve, case.plant, drives, errors, stated, case.noise)
     notes = [*case.notes, *([outlier_note(wild)] if wild else [])]
     return dataclasses.replace(case, outliers=case.outliers + wild, notes=notes), tuple(tables)
+
+
+def _as_stated(model: Model, d: Excitation) -> np.ndarray:
+    """Return the errors (N, outputs) with the start that the plant file states."""
+    try:
+        return d.y - model.run(model.prepare(d)).y
+    except SimulationError:
+        return np.full_like(d.y, np.nan)
 
 
 def worth(case: Case, null: Fitted, best: Fitted, reserve: Sequence[Table]) -> Worth:
@@ -140,35 +149,15 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
 
 def _errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Return the errors on a recording set aside, as `errors_aside`, of a plant with its events."""
-    from scipy.optimize import least_squares  # slow to load, and only starts of other recordings need it
-
-    model = compile_plant(plant)
-    d = model.prepare(model.excitation(table))
-    good = np.isfinite(d.y)
-    scale = np.broadcast_to([n.sigma for n in case.noise], d.y.shape)[good]
-    prior = np.array([model.plant.nodes[n].initial_sigma or 1.0 for n in model.uncertain])
-
-    def residuals(z: np.ndarray) -> np.ndarray:
-        """Return the errors over the noise, and the starts z in standard deviations."""
-        try:
-            y = model.run(d, None, z * prior).y
-        except SimulationError:
-            return np.full(len(scale) + len(z), np.nan)
-        return np.append((d.y - y)[good] / scale, z)
-
-    def slopes(z: np.ndarray) -> np.ndarray:
-        """Return their derivatives (rows, starts)."""
-        run = model.run(d, None, z * prior, sensitivities=True)
-        start = run.sensitivities[:, :, len(model.active) :][good] * prior
-        return np.concatenate([-start / scale[:, None], np.eye(len(z))])
-
+    free = tuple(q for q, p in plant.parameters.items() if p.range)
+    held = {q: dataclasses.replace(p, range=None) for q, p in plant.parameters.items()}
+    model = compile_plant(dataclasses.replace(plant, parameters=held), free)  # the same machine code
+    d = model.excitation(table)
     try:
-        z = np.zeros(len(prior))
-        if len(z) and np.isfinite(residuals(z)).all():
-            z = least_squares(residuals, z, slopes, max_nfev=STARTS).x
-        return d.y - model.run(d, None, z * prior).y
-    except SimulationError:
+        fitted = refit.fit_by_first_parts(model, [d], case.noise, tolerance=1e-3, seconds=np.inf)
+    except (SimulationError, InputError):  # InputError: it has no reading
         return np.full_like(d.y, np.nan)
+    return fitted.residuals[0]
 
 
 def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:
