@@ -27,7 +27,7 @@ from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import Searched, Weighed, search
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.coloured import coloured
-from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, timed
+from thermoctl.diagnosis.verdict.confirm import Confirm, brief, confirmed, timed
 from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
 from thermoctl.diagnosis.verdict.misfit import deviations, energies, standing, supported
@@ -186,8 +186,10 @@ def _chosen(
     if chosen not in tried:
         chosen = likeliest
     best = tried[chosen].fitted
-    # straight lines between rows know only how late switches are on average: an event may be one late switch
+    # straight lines between rows know only how late switches are on average: an event may be one late switch.
+    # So may one that is over before the next rows.
     late = any(i.linear and not i.stated for i in known.plant.inputs.values())
+    late = late or any(brief(best, key) for key in chosen)
     unsure = [key for key in chosen if key[0] == LAW or late and timed(best, key)]
     # beside known physics whose residual is only noise, there is no misfit that it could imitate
     quiet = only_noise(known, best, numbers) and not unsure

@@ -26,6 +26,7 @@ from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.report.words import listed
 from thermoctl.diagnosis.search.beam import Searched, Weighed
 from thermoctl.diagnosis.verdict import OVERRULED
+from thermoctl.diagnosis.verdict.confirm import BRIEF, brief
 from thermoctl.diagnosis.verdict.decide import Decision, Probabilities
 from thermoctl.diagnosis.verdict.families import Family
 from thermoctl.diagnosis.verdict.misfit import Energy, standouts
@@ -250,6 +251,11 @@ def _notes(d: Diagnosis) -> list[str]:
             else ["units of what was added to the plant do not fit it: left out"]
         ),
         *filter(None, [d.unknown]),
+        *(
+            f"{effect} at {where} is over within {BRIEF} rows: a switch that is logged early or late looks the same"
+            for effect, where in sorted(d.refused)
+            if any(brief(w.fitted, (effect, where)) for w in d.searched.tried)
+        ),
         *(
             f"{effect} at {where} is in the extended plant, but is no finding (probability "
             f"{chance(d.posterior.effects.get((effect, where), 0.0))})"

@@ -76,9 +76,9 @@ def levers(
 ) -> list[Lever]:
     """Find the inputs that moved in the recordings and can be commanded.
 
-    Inputs that moved together are one lever. Temperatures, sunshine and pressure belong to the surroundings
-    and are left out, unless `only` names them. `only`: the inputs that may be driven. `limits`: by input, a
-    range instead of the recorded one. Raises InputError for an unknown name."""
+    Inputs that moved together are one lever. Temperatures, sunshine, pressure and the time of day belong to
+    the surroundings and are left out, unless `only` names them. `only`: the inputs that may be driven.
+    `limits`: by input, a range instead of the recorded one. Raises InputError for an unknown name."""
     for n in only:
         if n not in plant.inputs:
             raise InputError(f"'{n}' is not an input of {plant.file}; there are {', '.join(plant.inputs)}")
@@ -86,7 +86,7 @@ def levers(
     for i in plant.inputs.values():
         surroundings = i.unit and any(dimension(i.unit) == dimension(u) for u in SURROUNDINGS)
         parts = recorded(tables, i.column)
-        if (i.name not in only if only else surroundings) or not _moved(parts):
+        if (i.name not in only if only else surroundings or i.role == "time_of_day") or not _moved(parts):
             continue
         values = np.concatenate(parts)
         partner = next((k for k, other in enumerate(series) if _together(values, other)), None)

@@ -38,6 +38,7 @@ FLOOR = 0.1  # added to mean squares over the noise: differences between errors 
 DRAWS = 3.0  # n independent normal rows have the participation ratio n / 3
 UNTOLD = 0.5  # probability of an event beside a misfit that no other recording can tell from it
 ACROSS = 2  # least number of recordings to predict one from the others
+ENDS, BRIEF = ("start", "end"), 2  # shapes of a window in time; number of rows in which a brief one is over
 SWEEPS = 2  # solutions; after each, the outputs' weights are computed again
 TINY = 1e-9
 
@@ -141,6 +142,15 @@ def timed(f: Fitted, key: Key) -> Candidate | None:
     """Return an effect if it depends on the time itself."""
     mine = (e.candidate for e in f.hypothesis.effects if e.key == key)
     return next((c for c in mine if c.effect.timed), None)
+
+
+def brief(f: Fitted, key: Key) -> bool:
+    """Return whether an effect is over within BRIEF rows: so is the error of a switch logged early."""
+    for e in (e for e in f.hypothesis.effects if e.key == key):
+        ends = [e.own[p.name] for p in e.candidate.effect.parameters if p.shape in ENDS]
+        times = [f.plant.parameters[q].value for q in ends]
+        return len(times) == len(ENDS) and times[1] - times[0] <= BRIEF * e.candidate.rig.sample
+    return False
 
 
 def _squares(sums: np.ndarray, step: np.ndarray) -> np.ndarray:
