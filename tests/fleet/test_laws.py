@@ -11,7 +11,7 @@ def law(n, sd, form="power"):
     """What diagnosis.json holds of a law over the velocity."""
     return {
         "expression": "A1 * velocity**n1",
-        "into": "velocity",
+        "where": "velocity",
         "share_closed": 0.74,
         "forms": [{"form": form, "variables": ["velocity"], "sizes": {"A": "A1"}, "shapes": {"n": "n1"}}],
         "parameters": {

@@ -933,3 +933,77 @@ def test_no_name_stands_beside_a_law_or_in_its_place(name):
     d = diagnose(made.plant, made.tables[:3], catalogue(), limits())
     assert not d.shown
     assert d.law.proposal.place == Place(law.target)
+
+
+def bowed(text):
+    """Two blocks, whose first thermometer has an error of its reading."""
+    truth, t = (
+        compile_plant(loads(TWO_BLOCKS.replace("value: one", f"value: 'one + {text}'"))),
+        np.arange(900) * 4.0,
+    )
+    tables = []
+    for k in range(2):
+        heat = np.repeat(np.random.default_rng(k).permutation([0, 2.5, 0.8, 0, 1.6, 3]), 150)
+        tables.append(
+            truth.measure(Table(f"run_{k}", "", t, {"heat": heat, "air_temperature": 21 + 0 * t}), k)
+        )
+    return tables
+
+
+@pytest.mark.parametrize(
+    ("error", "form", "power", "size"),
+    [("0.004 * (one - 21)**2", "curved", 2, 0.004), ("-0.15 * max(one - 40, 0)", "above", 1, -0.15)],
+)
+def test_a_sensor_that_is_not_linear_is_a_law_of_its_reading(error, form, power, size, tmp_path):
+    """Two effects of the body, a heat capacity and a conductance that vary, had each been named above 0.99."""
+    plant, tables = loads(TWO_BLOCKS), bowed(error)
+    d = diagnose(plant, tables, catalogue(), limits())
+    (law,) = d.laws
+    entry = law_entry([law], d.worth)
+    assert not d.shown and d.decision.verdict == "explained"
+    assert (entry["part"], entry["where"], entry["into"]) == ("reading", "temperature_1", None)
+    assert entry["forms"][0]["form"] == form and entry["parameters"]["A1"]["unit"] == "K"
+    assert "an error of the reading temperature_1, one + " in law_sentence(entry)
+    own = entry["parameters"]
+    assert own["A1"]["value"] / own["Z1"]["value"] ** power == pytest.approx(size, rel=0.15)
+    with pytest.raises(InputError, match="at temperature_1 of this plant alone"):
+        save_effect({"remainder": {"law": entry}}, "meter", tmp_path / "own")
+
+
+def test_a_reading_that_is_trusted_has_no_law():
+    plant = loads(TWO_BLOCKS.replace("inputs:", "sensors: trusted\ninputs:", 1))
+    d = diagnose(plant, bowed("0.004 * (one - 21)**2"), {}, limits())
+    assert all(law.proposal.place.part != "reading" for law in d.laws)
+
+
+@pytest.mark.parametrize(
+    ("rate", "form", "signals", "shapes"),
+    [
+        (
+            "-0.01 * (step(clock - 8) - step(clock - 20)) * (one - air)",
+            "scheduled_product",
+            {"clock", "one - air"},
+            {"l1": 14 / 24, "s1": 0.5},
+        ),
+        ("-2e-7 * worked * (one - air)", "worn", {"heat", "one - air"}, {}),
+    ],
+)
+def test_a_schedule_of_the_day_and_what_wears_change_a_flow(rate, form, signals, shapes):
+    """A cover at night was a power of the sunshine, and a filter that clogs was unexplained."""
+    slow = TWO_BLOCKS.replace("value: 6, unit: J/K, range: [2, 14]", "value: 60, unit: J/K, range: [20, 140]")
+    plant = loads(slow.replace("inputs:\n", "inputs:\n  clock: {unit: h, role: time_of_day}\n"))
+    more = Flow("more", ex.parse(rate), None, "one")
+    inputs = {**plant.inputs, "worked": Input("worked", "J", "worked", False)}
+    truth = compile_plant(replace(plant, inputs=inputs, flows={**plant.flows, "more": more}))
+    t, tables = np.arange(1000) * 100.0, []
+    for k in range(2):
+        heat = np.repeat(np.random.default_rng(k).permutation([0, 2.5, 0.8, 0, 1.6]), 200)
+        columns = {"heat": heat, "air_temperature": np.full(1000, 21.0), "clock": (7 * k + t / 3600) % 24}
+        worked = np.concatenate([[0.0], np.cumsum(heat[:-1] * 100.0)])
+        tables.append(truth.measure(Table(f"run_{k}", "", t, {**columns, "worked": worked}), k))
+        del tables[-1].columns["worked"]
+    (law,) = diagnose(plant, tables, {}, limits()).laws
+    assert [x.form.name for x in law.proposal.terms] == [form]
+    assert {s.label for x in law.proposal.terms for s in x.signals} == signals
+    values = law.fitted.plant.parameters
+    assert {q: values[f"{q}_law_one"].value for q in shapes} == pytest.approx(shapes, abs=0.02)

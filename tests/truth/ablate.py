@@ -192,7 +192,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "rarer": Rule(
         "a law has the odds `rare` once more where an effect at its nodes was tried in its place",
-        {"law.contest._rarer": lambda s, w: w},
+        {"law.contest._make_rarer": lambda s, which: None},
         searches=True,
     ),
     "answers": Rule(

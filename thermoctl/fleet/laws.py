@@ -48,7 +48,7 @@ def shared(laws: Mapping[str, Mapping[str, Any]]) -> list[Shared]:
             for shape, name in t["shapes"].items():
                 p = law["parameters"][name]
                 if p["sd"]:
-                    key = (law["into"], t["form"], tuple(t["variables"]), shape)
+                    key = (law["where"], t["form"], tuple(t["variables"]), shape)
                     by_term.setdefault(key, {})[rig] = (p["value"], p["sd"])
     return [_shared(term, values) for term, values in by_term.items() if len(values) > 1]
 
@@ -65,7 +65,7 @@ def _shared(term: Term, values: Mapping[str, tuple[float, float]]) -> Shared:
 
 def side_by_side(laws: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a table of laws, one row for each rig."""
-    table = Table("rig", "law", "into", "95 %", "closes", box=None, header_style="bold")
+    table = Table("rig", "law", "where", "95 %", "closes", box=None, header_style="bold")
     for rig, law in laws.items():
         intervals = [
             f"{name} {p['value']:.3g} ± {WIDE * p['sd']:.2g}"
@@ -74,7 +74,7 @@ def side_by_side(laws: Mapping[str, Mapping[str, Any]]) -> Table:
             if (p := law["parameters"][name])["sd"]
         ]
         closed = f"{100 * law['share_closed']:.0f} %"
-        table.add_row(rig, law["expression"], law["into"], "\n".join(intervals), closed)
+        table.add_row(rig, law["expression"], law["where"], "\n".join(intervals), closed)
     return table
 
 

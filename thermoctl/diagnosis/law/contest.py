@@ -6,7 +6,7 @@ choice among places, signals and forms makes them smaller (`Proposal.cost`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -79,21 +79,26 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         say("looking for laws at two places")
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
-    s.tried = {keys: _rarer(s, w) for keys, w in s.tried.items()}
+    lead, weighed = s.best, {*s.tried}
+    _make_rarer(s, weighed)
+    if s.best.fitted is not lead.fitted:
+        _fewer(s)
+        _make_rarer(s, s.tried.keys() - weighed)
     return searched(s)
 
 
-def _rarer(s: Search, w: Weighed) -> Weighed:
-    """Return a hypothesis; with the odds `rare` once more where an effect was tried in place of its law.
+def _make_rarer(s: Search, which: Set[Keys]) -> None:
+    """Give hypotheses the odds `rare` once more where an effect was tried in place of their law.
 
     Known physics at a node is likelier than an unknown law there that imitates it."""
-    if not any(_replaced(w, law, other) for law in laws_of(w.fitted) for other in s.tried.values()):
-        return w
-    return replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
+    for keys in which:
+        w = s.tried[keys]
+        if any(_replaced(w, law, other) for law in laws_of(w.fitted) for other in s.tried.values()):
+            s.tried[keys] = replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
 
 
 def _replaced(w: Weighed, law: PlacedLaw, other: Weighed) -> bool:
-    """Return whether another hypothesis has an effect at a law's nodes in place of the law."""
+    """Return whether another hypothesis has an effect at a law's nodes or reading in its place."""
     keys = w.fitted.hypothesis.keys
     new = [e for e in other.fitted.hypothesis.effects if e.key not in keys]
     if len(new) != 1 or isinstance(new[0], PlacedLaw) or keys - other.fitted.hypothesis.keys != {law.key}:
@@ -101,7 +106,8 @@ def _replaced(w: Weighed, law: PlacedLaw, other: Weighed) -> bool:
     place, flows = new[0].candidate.place, other.fitted.plant.flows
     flow = flows.get(place.flow or "")
     ends = {flow.source, flow.target} if flow else set()
-    return not {*law.proposal.place.nodes}.isdisjoint({*place.nodes.values(), *ends})
+    own = law.proposal.place
+    return not {*own.nodes, own.target}.isdisjoint({*place.nodes.values(), *ends, place.output})
 
 
 def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:

@@ -96,18 +96,20 @@ def found_law(
 ) -> FoundLaw:
     """Return the law of a hypothesis with its curve. `parent`: the hypothesis without it."""
     p = law.proposal
-    drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f, law), f.plant)
+    drawn = None
+    if p.place.part == "flow":
+        drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f, law), f.plant)
     return FoundLaw(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
 
 
 def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:
     """Return the flow at the law's place as a free function of its first signal, and the law there.
 
-    None for a law with a memory or of a storage. None, too, if the plant without it lacks one of its signals:
+    None for a law with a memory. None, too, if the plant without it lacks one of its signals:
     a lag of a sensor that was found beside it makes such signals. The free function is the law plus a fit to
     its residual."""
     signals = [s for t in p.terms for s in t.signals]
-    if not signals or p.place.part != "flow" or any(t.form.memory for t in p.terms):
+    if not signals or any(t.form.memory for t in p.terms):
         return None
     s = signals[0]
     parameters = {q: v.value for q, v in plant.parameters.items()}

@@ -208,11 +208,13 @@ def families(
                 "position": z.position,
                 "gap": z.position,
                 "input": z.recorded,
+                "spent": z.recorded,
                 "loaded": z.drives,
+                "reading": z.reading,
             }
             if form.twin and z.visited[0] >= -NEGLIGIBLE:
                 continue  # the recordings cannot tell the two apart
-            if z.daily if form.of == "time_of_day" else fits.get(form.of, True) and not z.daily:
+            if z.daily if form.of in ("time_of_day", "timed") else fits.get(form.of, True) and not z.daily:
                 shapes = combined({q: s.scaled(s.values, z, duration) for q, s in form.shapes.items()})
                 out += [Family(form, pair, shapes, duration, sample) for pair in _pairs(form, z, every)]
     return [f for f in out if f.count]  # a signal with one value only has no two thresholds
@@ -220,7 +222,7 @@ def families(
 
 def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal, ...]]:
     """Return the tuples of signals that a form may have with z as the first one."""
-    if form.of not in ("two", "warmed", "gap", "driven", "loaded"):
+    if form.of not in ("two", "warmed", "gap", "driven", "loaded", "timed", "spent"):
         return [(z,)]
     second = [w for w in every if w != z and not w.daily and (w.drives or form.of != "driven")]
     return [(z, w) for w in second if form.name != "product" or z.label < w.label]
@@ -258,7 +260,9 @@ def law_effect(law: Sequence[Term], place: Place, unit: str | None) -> Effect:
             node = {"name": f"m{k}", "storage": 1, "initial": memory.start}
             changes.append({"node": {**node, "initial_sigma": memory.start_sigma}})
             changes.append({"flow": {"into": f"m{k}", "rate": str(term.filling(k))}})
-    if place.part == "storage":
+    if place.part == "reading":
+        changes.append({"value": str(ex.add(name("y"), rate))})
+    elif place.part == "storage":
         changes.append({"storage": str(ex.add(name("storage"), rate))})
     else:
         for k, (_, share) in enumerate(place.shares, 1):

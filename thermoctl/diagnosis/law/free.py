@@ -67,7 +67,7 @@ def entered(case: Case, f: Fitted, where: Sequence[Place], most: int) -> list[st
 def choices(
     case: Case, rig: Rig, where: Sequence[Place], nodes: Sequence[str], linear: Tracked
 ) -> list[tuple[Place, Signal]]:
-    """Return the places at some nodes, each with every signal that a law there may depend on.
+    """Return the places at some nodes, and of readings, each with every signal that a law may depend on.
 
     A flow between nodes that the plant file does not link has to explain something at both. A node that an
     effect added is no signal if nothing but a reading depends on it: a slow gauge opens no valve."""
@@ -78,6 +78,8 @@ def choices(
 
     def explains(p: Place) -> bool:
         """Return whether a law at a place may explain something at the nodes."""
+        if p.part == "reading":
+            return True
         new = p.source and not p.of and {*p.nodes} not in links
         return {*p.nodes} <= {*nodes} if new else bool({*p.nodes} & {*nodes})
 

@@ -58,6 +58,11 @@ NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms 
 # Number of terms of each law of a pair; number of pairs, and of those that hold the same law.
 EACH, COUPLES, SHARED = 8, 6, 2
 ADDED = 4  # number of terms of a law's own signals that are added to it
+PLAIN = (
+    "constant",
+    "linear",
+)  # forms that are no laws of a reading: an offset, and a gain as in the catalogue
+SLIGHT = ("timed", "spent")  # forms of two signals, of which the first one alone shows little
 KEPT = 20  # number of values of the shapes of a form over a signal that are kept for sums
 
 
@@ -124,19 +129,27 @@ class Found:
 def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposal]:
     """Return the most promising laws, best first. Raises SimulationError.
 
-    Laws of unread columns take no turn from the others: the best of both kinds come one by one."""
+    Laws of unread columns, and of readings, take no turn from the others: the best of each kind come one by
+    one. The trajectory that follows a reading has the reading's error: so its laws are proposed about the
+    refit's own."""
     rig, where, linear = linearised(case, parent)
     combos = choices(case, rig, where, linear.likely[:NODES], linear)
     base, pool, kinds = (log_number(combos), limits), list[Found](), list[list[Proposal]]()
-    for part, new in _in_turn(rig, combos):
+    for part, new in _in_turn(rig, [c for c in combos if c[0].part != "reading"]):
         pool = _best_first([*pool, *_terms(case, rig, linear, ranked(linear, part), COMBINATIONS, new)])
-        out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
-        for place in dict.fromkeys(f.place for f in pool):
-            out += _sums(linear, place, [f for f in pool if f.place == place], base)
-        out.sort(key=lambda p: -p.score)
-        kinds.append(_mixed([p for p in out if not new or _reads(p.terms, new)]))
+        kinds.append(_mixed([p for p in _of(linear, pool, base) if not new or _reads(p.terms, new)]))
+    linear, read = at_refit(case, parent), [c for c in combos if c[0].part == "reading"]
+    kinds.append(_mixed(_of(linear, _terms(case, rig, linear, ranked(linear, read), COMBINATIONS), base)))
     kinds.sort(key=lambda ps: -max((p.score for p in ps), default=-np.inf))
     return [p for ps in itertools.zip_longest(*kinds) for p in ps if p]
+
+
+def _of(linear: Tracked, pool: Sequence[Found], base: tuple[float, Thresholds]) -> list[Proposal]:
+    """Return the laws of one term, and of sums of terms, the best first."""
+    out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
+    for place in dict.fromkeys(f.place for f in pool):
+        out += _sums(linear, place, [f for f in pool if f.place == place], base)
+    return sorted(out, key=lambda p: -p.score)
 
 
 def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list[Proposal]:
@@ -191,9 +204,9 @@ def _terms(
     for place in dict.fromkeys(p for _, p, _ in free[:count]):
         first = [s for _, p, s in free[:count] if p == place]
         own = [s for _, p, s in free if p == place]
-        flows = [s for s in rates(rig, place, linear.metric.signals, own) if s.label in case.plant.flows]
-        every = [*own[:SECOND], *flows]  # a law is no factor of an effect
-        pool += _singles(linear, place, first, every, new)
+        # not as effects change them: a law must not need an effect
+        flows = rates(case.plant, place, linear.metric.signals, own)
+        pool += _singles(linear, place, first, [*own[:SECOND], *flows], new)
     pool = _best_first(pool)
     return _best_first([*pool, *(_zoomed(linear, f) for f in _varied(pool)[:ZOOMED])])
 
@@ -266,9 +279,14 @@ def _singles(
     duration = max(float(d.t[-1]) for d in linear.metric.drives)
     sample = max(float(np.median(np.diff(d.t))) for d in linear.metric.drives)
     out = []
-    tried = [f for f in families(first, every, duration, sample) if not new or _reads((f,), new)]
-    if place.part != "flow":
+    tried = families(first, every, duration, sample)
+    others = [s for s in every if s not in first]
+    tried += [f for f in families(others, every, duration, sample) if f.form.of in SLIGHT]
+    tried = [f for f in tried if not new or _reads((f,), new)]
+    if place.part in ("storage", "parameter"):
         tried = [f for f in tried if not f.form.memory]  # a capacity remembers nothing
+    if place.part == "reading":
+        tried = [f for f in tried if f.form.name not in PLAIN]
     for part in chunks(tried, lambda f: f.count, CHUNK):
         of_families = zip(*(linear.along(f.values) for f in part), strict=True)
         x = linear.columns(place, [np.concatenate(q, axis=1) for q in of_families])

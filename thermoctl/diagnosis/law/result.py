@@ -42,7 +42,7 @@ def law_entry(laws: Sequence[FoundLaw], worth: Worth) -> dict[str, Any] | None:
         "part": place.part,
         "expression": equation(f, law.placed),
         "plain": plain(f, law.placed),
-        "into": place.target,
+        "into": None if place.part == "reading" else place.target,
         "from": place.source,
         "shares": {node: str(share) for node, share in place.shares},
         "terms": [str(t.expression(k)) for k, t in enumerate(p.terms, 1)],
@@ -57,7 +57,7 @@ def law_entry(laws: Sequence[FoundLaw], worth: Worth) -> dict[str, Any] | None:
         "share_closed": worth.share_closed,
         "held_out": worth.reserved,
         "equivalent": family(law),
-        "effect": None if place.of else effect_file(law),
+        "effect": None if place.of or place.part == "reading" else effect_file(law),
         "beside": [law_entry([other], worth) for other in others],
     }
 

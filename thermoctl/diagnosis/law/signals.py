@@ -32,7 +32,8 @@ class Place:
     - storage: of the node `target`
     - conversion: several flows of the plant file that are always in proportion, `of`. For each unit into
       the target a share, an expression of parameters, goes into other nodes: `shares`
-    - parameter: one in several flows, `of`. It changes each of the nodes by its share for each unit"""
+    - parameter: one in several flows, `of`. It changes each of the nodes by its share for each unit
+    - reading: added to the output `target`"""
 
     target: str
     source: str | None = None
@@ -57,7 +58,7 @@ class Place:
     @property
     def ends(self) -> tuple[tuple[str, Expr], ...]:
         """Return the nodes that it changes, the target first, each with its share of the flow."""
-        if self.part == "parameter":
+        if self.part in ("parameter", "reading"):
             return self.shares
         source = ((self.source, num(-1.0)),) if self.source else ()
         return ((self.target, ex.ONE), *source, *self.shares)
@@ -69,7 +70,7 @@ class Signal:
 
     `visited`: its evenly spaced quantiles, as (value - centre) / size. `drives`: is it a difference or a
     velocity that drives the flow at its place, so that the flow reverses with it? `daily`: is it the time of
-    day? Its size then is a day."""
+    day? Its size then is a day. `reading`: is it what a sensor reads, whose error the law is?"""
 
     label: str
     value: Expr
@@ -82,6 +83,7 @@ class Signal:
     drives: bool = False
     recorded: bool = False
     daily: bool = False
+    reading: bool = False
 
     def along(self, run: Values, t: np.ndarray) -> np.ndarray:
         """Return its values (N,) along a trajectory."""
@@ -90,14 +92,15 @@ class Signal:
 
 
 def places(rig: Rig) -> list[Place]:
-    """Return the places of laws: flows into and between nodes, storages, and conversions.
+    """Return the places of laws: flows into and between nodes, storages, conversions, parameters, readings.
 
-    A storage of 1 is a definition: dn/dt is the sum of the flows."""
+    A storage of 1 is a definition: dn/dt is the sum of the flows. A reading that is trusted has no law."""
     nodes = storing(rig)
     stored = [Place(n, None, "storage") for n in nodes if rig.physics.nodes[n].storage is not ex.ONE]
     joined = conversions(rig.physics, nodes)
     flows = [*map(Place, nodes), *(Place(b, a) for a, b in exchanging(rig))]
-    return [*flows, *stored, *joined, *shared(rig.physics, nodes, joined)]
+    read = [Place(o, None, "reading") for o in rig.physics.outputs if not rig.plant.trusts(o)]
+    return [*flows, *stored, *joined, *shared(rig.physics, nodes, joined), *read]
 
 
 def shared(plant: Plant, nodes: Sequence[str], joined: Sequence[Place]) -> list[Place]:
@@ -183,8 +186,13 @@ def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs.
 
-    A node that is linked to the place only through two or more others is no signal: it acts through these."""
+    A node that is linked to the place only through two or more others is no signal: it acts through these.
+    The error of a reading depends on what is read."""
     p, out = rig.physics, []
+    if place.part == "reading":
+        o = p.outputs[place.target]
+        own = Signal(o.name, o.sensed or o.value, "K" if o.unit in TEMPERATURE else o.unit, reading=True)
+        return [s for s in [_sized(own, runs)] if s]
     near = [*place.nodes, *(rig.pairs[n] for n in place.nodes if n in rig.pairs)]
     for n in near:
         out += [_between(rig, place, n, i) for i in _beside(rig, n)]
@@ -205,8 +213,8 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     return [s for s in sized if s is not None]
 
 
-def rates(rig: Rig, place: Place, runs: Sequence[Values], beside: Sequence[Signal]) -> list[Signal]:
-    """Return the plant's own flows at a place that no signal `beside` them is in proportion to.
+def rates(plant: Plant, place: Place, runs: Sequence[Values], beside: Sequence[Signal]) -> list[Signal]:
+    """Return the plant file's flows at a place that no signal `beside` them is in proportion to.
 
     As factors of a law: inhibition, fouling and wear change a flow that the plant has."""
     if place.part != "flow":
@@ -219,7 +227,7 @@ def rates(rig: Rig, place: Place, runs: Sequence[Values], beside: Sequence[Signa
         v = _values(rate, runs)
         return any(abs(v @ w) > ALIKE * np.linalg.norm(v) * np.linalg.norm(w) for w in known)
 
-    at = [f for f in rig.physics.flows.values() if ends <= {f.source, f.target} and not ex.calls_fmu(f.rate)]
+    at = [f for f in plant.flows.values() if ends <= {f.source, f.target} and not ex.calls_fmu(f.rate)]
     sized = [_sized(Signal(f.name, f.rate, f.unit), runs) for f in at if not alike(f.rate)]
     return [s for s in sized if s is not None]
 
@@ -245,7 +253,8 @@ def _beside(rig: Rig, n: str) -> list[str]:
         others = rig.moving_inputs - set().union(*rates)
         return sorted(i for i in others if unit and inputs[i].unit == unit)
     exchanged = {i for read in rates if n in read for i in read & {*rig.heat_inputs}}
-    return sorted({rig.air} | exchanged if rig.air else exchanged, key=lambda i: (i != rig.air, i))
+    moving = {i for i in rig.heat_inputs if i in rig.moving_inputs}
+    return sorted(({rig.air} if rig.air else set()) | exchanged | moving, key=lambda i: (i != rig.air, i))
 
 
 def _far(p: Plant, place: Place) -> set[str]:
@@ -305,7 +314,7 @@ def _sized(s: Signal, runs: Sequence[Values]) -> Signal | None:
     values = _values(s.value, runs)
     reach = HOME * float(np.ptp(values))  # a position counts from its zero where it comes near it
     away = s.position and not values.min() - reach < 0 < values.max() + reach
-    centre = float(np.mean(values)) if s.kelvin is not None or away else 0.0
+    centre = float(np.mean(values)) if s.kelvin is not None or s.reading or away else 0.0
     size = float(np.sqrt(np.mean((values - centre) ** 2)))
     if not np.isfinite(size) or float(np.ptp(values)) <= 1e-9 * max(size, 1e-300):
         return None

@@ -149,6 +149,9 @@ def _responses(metric: Metric, place: Place, flows: Sequence[np.ndarray]) -> np.
 def _pushed(metric: Metric, place: Place, flows: Sequence[np.ndarray], r: int) -> Pushed:
     """Return the changes of slopes that flows (N, k) at a place cause in recording r."""
     model, t = metric.model, metric.drives[r].t
+    if place.part == "reading":
+        j = list(model.plant.outputs).index(place.target)
+        return Pushed([], np.empty((len(t), 0)), {(j, c): q for c, q in enumerate(flows[r].T)})
     forces, q = list[tuple[int, int]](), []
     for node, share in place.ends:
         storage = ex.series(model.plant.nodes[node].storage, metric.signals[r], t)
@@ -337,6 +340,9 @@ def law_unit(plant: Plant, place: Place) -> str | None:
     """Return the unit of a law at a place, None where the plant states none."""
     if place.part == "parameter":
         return plant.parameters[place.of[0]].unit
+    if place.part == "reading":
+        read = plant.outputs[place.target].unit
+        return "K" if read in TEMPERATURE else read
     flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
     if place.part == "flow" or not flow or not own:
         return flow if place.part == "flow" else None

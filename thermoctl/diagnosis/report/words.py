@@ -129,6 +129,7 @@ def law_sentence(entry: Result, head: str = "A law for it") -> str:
         "flow": f"a flow {ends}",
         "storage": f"a storage of {entry['into']}",
         "parameter": f"a change of the parameter {entry['where']}",
+        "reading": f"an error of the reading {entry['where']}",
     }[entry.get("part", "flow")]
     chances = f"that a law acts there has probability {chance(entry['probability'])}; this form fits best"
     short = f", that is {entry['plain']}" if entry.get("plain") else ""
