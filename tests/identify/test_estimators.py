@@ -296,6 +296,47 @@ def test_a_calibration_that_does_not_fit_is_refused(tmp_path):
         modelfile.load_model(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "place, value, message",
+    [
+        ("units.offset_um", "mm", r"a.yaml:\d+:\d+: offset_um: 'mm', expected 'um'"),
+        ("model", "text", "model: a mapping was expected, found 'text'"),
+        ("figures", [1], "figures: a mapping was expected, found a list"),
+        ("model.A_minus_I", 1.0, r"A_minus_I has shape \(\), expected \(1, 1\)"),
+        ("model.A_minus_I", [[0.1]], "a pole outside the unit circle"),
+        ("model.A_minus_I", [["-0.1"]], "A_minus_I holds something that is no number"),
+        ("model.R_v", "1.0", "R_v is '1.0', expected a number above 0"),
+        ("model.f1", float("nan"), "f1 is nan, expected a finite number"),
+        ("model.period_s", 10**400, "cannot be read as int"),
+        ("model.sensors", None, "not the entries of a model of this version"),
+        ("model.points", [1] * 12, "12 points with 12 names"),
+        ("model.gain_of_old", 1.0, "not the entries of a model of this version"),
+    ],
+)
+def test_a_calibration_of_another_content_is_refused_at_its_line(tmp_path, place, value, message):
+    """Its checksum is right, as a program of another version would write it; half of these ended with a traceback."""
+    path = modelfile.save_model(tmp_path / "a.yaml", zero_model(), "bench")
+    content = yaml.safe_load(path.read_text())
+    del content["checksum"]
+    *above, key = place.split(".")
+    (content[above[0]] if above else content)[key] = value
+    if value != 10**400:
+        content["checksum"] = modelfile._checksum(content)
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=message):
+        modelfile.load_model(path)
+
+
+def test_a_damaged_marker_is_named_and_replaced(tmp_path):
+    one = modelfile.install(tmp_path, zero_model(), "bench")
+    (tmp_path / "0x-copy.yaml").write_text("")
+    assert modelfile.install(tmp_path, zero_model(), "bench").name.startswith("0002-")
+    (tmp_path / "current").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="current: names .*rollback NAME"):
+        modelfile.load_model(tmp_path)
+    assert modelfile.roll_back(tmp_path, one.name) == modelfile.current(tmp_path) == one
+
+
 # online
 def compensator(gain):
     b = np.zeros(12)

@@ -33,6 +33,7 @@ from thermoctl.calibration.report import report
 from thermoctl.calibration.schedules import of_config, span
 from thermoctl.calibration.simulated_rig import SimulatedRig
 from thermoctl.configuration.settings import Settings, effective
+from thermoctl.files.kept import reading
 from thermoctl.files.safe_file import make_folder, move, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import modelfile, tuning
@@ -90,12 +91,14 @@ class Wizard:
             self._load()
 
     def _load(self) -> None:
-        try:
-            state = json.loads(self.state_path.read_text())
+        with reading(
+            self.state_path, "a calibration's state", "give another --out, or start again with --again"
+        ):
+            state = json.loads(self.state_path.read_bytes())
+            if state.pop("checksum") != _checksum(state):
+                raise ValueError("its checksum does not fit")
             self.done = {k: RESULTS[k](**v) for k, v in state["done"].items()}
             self.at_s, configuration = state["at_s"], state["configuration"]
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise InputError(f"{self.state_path}: not a calibration's state; give another --out") from None
         if configuration != self.fingerprint:
             raise InputError(
                 f"{self.folder}: was started with another configuration or other experiments than {self.settings.path} has now; "
@@ -110,6 +113,7 @@ class Wizard:
         make_folder(self.folder)
         done = {k: asdict(v) for k, v in self.done.items()}
         state = {"configuration": self.fingerprint, "done": done, "at_s": self.at_s}
+        state["checksum"] = _checksum(state)
         write_text(self.state_path, json.dumps(state, indent=1))
 
     def result(self, step: str, kind: type[_R]) -> _R:
@@ -274,7 +278,7 @@ class Wizard:
             raise InputError(
                 f"{self.folder}: the proof shows no smaller error with the new model than without; nothing was installed"
             )
-        c = modelfile.load_calibration(self._model_path)
+        c = modelfile.load_calibration(self._model_path, self.settings.rig.name)
         figures: dict[str, Any] = {
             **c.figures,
             "proof_before_um": list(proof.before),
@@ -296,6 +300,10 @@ class Wizard:
         self.say(
             f"{path} is current; older ones stay (`thermoctl model rollback`). `thermoctl restart` uses it."
         )
+
+
+def _checksum(state: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
 
 
 def _progress_line(time_left: Callable[[Progress], tuple[float, float]]) -> Callable[[Progress], None]:

@@ -8,6 +8,7 @@ to the loop through shared memory, and are stored in recordings.
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field, fields
+from operator import index
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,14 @@ def _array(unit: str, *shape: str | int) -> Any:
 def _number(unit: str = "", default: Any = MISSING, positive: bool = False) -> Any:
     """Return the dataclass field of a scalar, with its unit and whether it must be positive."""
     return field(default=default, metadata={"unit": unit, "positive": positive})
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """Return a copy as float64. Raises ValueError for texts and other things that are no numbers."""
+    array = np.array(value, order="C")
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"compensator model: {name} holds something that is no number")
+    return array.astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -71,11 +80,12 @@ class CompensatorModel:
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
-            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64, order="C"))
+            object.__setattr__(self, name, _numbers(name, getattr(self, name)))
+        object.__setattr__(self, "sensors", tuple(map(index, self.sensors)))
         if self.gain.ndim == 1:
             object.__setattr__(self, "gain", self.gain.reshape(-1, 1))
-        m = self.C.shape[0]
-        sizes = {"n": self.A_minus_I.shape[0], "s": len(self.sensors), "m": m}
+        m = len(np.atleast_1d(self.C))
+        sizes = {"n": len(np.atleast_1d(self.A_minus_I)), "s": len(self.sensors), "m": m}
         for f in _MODEL_FIELDS:
             if "shape" in f.metadata:
                 self._check_array(f.name, tuple(sizes.get(k, k) for k in f.metadata["shape"]))
@@ -86,8 +96,13 @@ class CompensatorModel:
         if sizes["n"] > MAX_ORDER:
             raise ValueError(f"compensator model: order {sizes['n']}, expected at most {MAX_ORDER}")
         self._check_points(m)
+        self._check_stable()
+
+    def _check_stable(self) -> None:
         if self.R_w < 0.0:
             raise ValueError(f"compensator model: R_w is {self.R_w}, expected at least 0")
+        if np.abs(1.0 + np.linalg.eigvals(self.A_minus_I)).max(initial=0.0) > 1.0 + 1e-9:
+            raise ValueError("compensator model: A_minus_I has a pole outside the unit circle")
         if abs(self.f1) >= 1.0:
             raise ValueError(
                 f"compensator model: f1 is {self.f1}, expected |f1| < 1 (a stable expansion model)"
@@ -98,7 +113,8 @@ class CompensatorModel:
             raise ValueError(
                 f"compensator model: sensors {self.sensors}, expected 0 (the coil) first, all below {m}"
             )
-        if not 1 <= m <= MAX_POINTS or len(self.points) not in (0, m):
+        named = len(self.points) in (0, m) and all(isinstance(p, str) for p in self.points)
+        if not 1 <= m <= MAX_POINTS or not named:
             raise ValueError(
                 f"compensator model: {m} points with {len(self.points)} names, expected 1 to {MAX_POINTS}, each named"
             )
@@ -114,9 +130,14 @@ class CompensatorModel:
 
     def _check_number(self, name: str, positive: bool) -> None:
         number = getattr(self, name)
-        if not np.isfinite(number) or (positive and number <= 0.0):
+        real = (
+            isinstance(number, int | float | np.number)
+            and not isinstance(number, bool)
+            and -np.inf < number < np.inf
+        )
+        if not real or (positive and number <= 0.0):
             expected = "a number above 0" if positive else "a finite number"
-            raise ValueError(f"compensator model: {name} is {number}, expected {expected}")
+            raise ValueError(f"compensator model: {name} is {number!r}, expected {expected}")
 
 
 _MODEL_FIELDS = fields(CompensatorModel)

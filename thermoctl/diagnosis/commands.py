@@ -27,6 +27,7 @@ from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import sentences, what_next
 from thermoctl.diagnosis.show import read
 from thermoctl.diagnosis.workers import cluster
+from thermoctl.files.kept import reading
 from thermoctl.files.yamlfile import InputError
 from thermoctl.interrupt import Interrupted
 from thermoctl.plant import load
@@ -181,7 +182,10 @@ def save_law(args: argparse.Namespace) -> int:
             "effects save: the folder of a diagnosis and a name were expected: effects save DIR NAME"
         )
     folder, label = args.files
-    for path in save_effect(read(Path(folder)), label, Path((args.effects or ["effects"])[0])):
+    result, own = read(Path(folder)), Path((args.effects or ["effects"])[0])
+    with reading(Path(folder) / "diagnosis.json", "the result of a diagnosis", "diagnose again"):
+        paths = save_effect(result, label, own)
+    for path in paths:
         print(f"written: {path}; `thermoctl diagnose --effects {path.parent}` finds it by name")
     return 0
 

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.report.explain import NOTHING, explain, why
+from thermoctl.files.kept import reading
 from thermoctl.files.yamlfile import InputError, suggest
 
 
@@ -21,7 +22,8 @@ def explained(folder: str, effect: str | None = None, own: Sequence[str] = ()) -
 
     Raises InputError where there is none, and for a name that is no effect."""
     result = read(Path(folder))
-    answer = why(result, effect) if effect else explain(result)
+    with reading(Path(folder) / "diagnosis.json", "the result of a diagnosis", "diagnose again"):
+        answer = why(result, effect) if effect else explain(result)
     if effect and answer.endswith(NOTHING):
         known = catalogue((CATALOGUE, CATALOGUE.parent / "mistakes", *map(Path, own)))
         asked = effect.partition(" at ")[0].replace(" ", "_")
@@ -75,12 +77,8 @@ def effects(args: argparse.Namespace) -> int:
 def read(folder: Path) -> dict[str, Any]:
     """Read the result of an earlier diagnosis. Raises InputError."""
     path = folder / "diagnosis.json"
-    try:
-        result = json.loads(path.read_text())
-    except OSError:
-        raise InputError(f"{path}: no such file; the folder of a diagnosis (--out) was expected") from None
-    except ValueError as e:
-        raise InputError(f"{path}: no JSON ({e}); diagnose again") from None
+    with reading(path, "the folder of a diagnosis (--out)", "diagnose again"):
+        result = json.loads(path.read_bytes())
     if (
         not isinstance(result, dict)
         or not {"decision", "hypotheses", "lost", "refused", "promised"} <= result.keys()

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE
+from thermoctl.files.kept import reading
 from thermoctl.files.shipped import shipped
 
 _SOURCE = (".py", ".pyx", ".pxd", ".h")  # suffixes of code
@@ -71,10 +72,10 @@ def _digest(paths: Iterable[Path]) -> str:
 def done(job: Job, out: Path) -> bool:
     """Check whether `out` holds this job's result by this version of the program."""
     try:
-        run = json.loads((out / "run.json").read_text())
-    except (OSError, ValueError):
+        run = json.loads((out / "run.json").read_bytes())
+    except (OSError, ValueError, RecursionError):
         return False
-    return bool(run.get("fingerprint") == job.fingerprint())
+    return isinstance(run, dict) and run.get("fingerprint") == job.fingerprint()
 
 
 def outcome(job: Job, cases: Path) -> tuple[dict[str, Any] | None, Run]:
@@ -82,4 +83,7 @@ def outcome(job: Job, cases: Path) -> tuple[dict[str, Any] | None, Run]:
     folder = cases / job.name
     run: Run = json.loads((folder / "run.json").read_text())
     path = folder / "diagnosis.json"
-    return (json.loads(path.read_text()) if not run["error"] and path.exists() else None), run
+    if run["error"] or not path.exists():
+        return None, run
+    with reading(path, "the result of a diagnosis", f"delete {folder} and run this again"):
+        return json.loads(path.read_bytes()), run

@@ -19,9 +19,11 @@ import yaml
 
 from thermoctl.control.model import UNITS, CompensatorModel
 from thermoctl.files import safe_file
-from thermoctl.files.yamlfile import InputError, Node, load
+from thermoctl.files.yamlfile import InputError, Node, kind_of, load
 
 FORMAT = "thermoctl-model/1"
+_ENTRIES = {"rig": str, "created": str, "units": dict, "fingerprints": dict, "figures": dict, "model": dict}
+_CHOOSE = "'thermoctl model rollback NAME' chooses one of the folder"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,80}")
 
 
@@ -90,27 +92,42 @@ def load_calibration(path: str | Path, rig: str | None = None) -> Calibration:
     content = root.plain()
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise root.error(f"not a calibration; 'format: {FORMAT}' was expected")
-    lacking = {"rig", "created", "units", "fingerprints", "figures", "model", "checksum"} - set(content)
-    if lacking:
-        raise root.error(f"'{sorted(lacking)[0]}' is missing; the file is not whole")
-    if content["checksum"] != _checksum({k: v for k, v in content.items() if k != "checksum"}):
-        raise root.value["checksum"].error(
-            "the checksum does not fit: the file was changed after it was written; "
-            "use another calibration ('thermoctl model list')"
-        )
+    _check_entries(root, content)
     if rig is not None and content["rig"] != rig:
         raise root.value["rig"].error(
             f"the calibration is of rig '{content['rig']}', this one is '{rig}'; calibrate this rig"
         )
     node: Node = root.value["model"]
-    numbers: dict[str, Any] = {
-        k: tuple(v) if k in ("sensors", "points") else v for k, v in content["model"].items()
-    }
+    numbers: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["model"].items()}
     try:
         model = CompensatorModel(**numbers)
-    except (TypeError, ValueError) as e:
-        raise node.error(str(e)) from None
+    except TypeError as e:
+        raise node.error(
+            f"not the entries of a model of this version ({e}); calibrate this rig again"
+        ) from None
+    except ValueError as e:
+        raise node.error(f"{e}; calibrate this rig again") from None
     return Calibration(model, content["rig"], content["created"], content["fingerprints"], content["figures"])
+
+
+def _check_entries(root: Node, content: dict[str, Any]) -> None:
+    """Raise InputError where the file lacks an entry, has one of another kind or unit, or was changed."""
+    lacking = {*_ENTRIES, "checksum"} - set(content)
+    if lacking:
+        raise root.error(f"'{sorted(lacking)[0]}' is missing; the file is not whole")
+    for key, kind in _ENTRIES.items():
+        if not isinstance(content[key], kind):
+            wanted = "text" if kind is str else "a mapping"
+            raise root.value[key].error(f"{key}: {wanted} was expected, found {kind_of(root.value[key])}")
+    if content["checksum"] != _checksum({k: v for k, v in content.items() if k != "checksum"}):
+        raise root.value["checksum"].error(
+            "the checksum does not fit: the file was changed after it was written; "
+            "use another calibration ('thermoctl model list')"
+        )
+    for name, unit in content["units"].items():
+        if unit != UNITS.get(name):
+            node = root.value["units"].value[name]
+            raise node.error(f"{name}: '{unit}', expected '{UNITS.get(name)}'; calibrate this rig again")
 
 
 def load_model(
@@ -137,7 +154,7 @@ def install(
 ) -> Path:
     """Save a calibration as the folder's newest and make it current; the one before stays for a roll back."""
     folder = Path(folder)
-    number = 1 + max((int(p.stem.split("-")[0]) for p in folder.glob("[0-9]*-*.yaml")), default=0)
+    number = 1 + max((int(re.findall(r"\d+", p.name)[0]) for p in history(folder)), default=0)
     path = save_model(
         folder / f"{number:04d}-{datetime.now(UTC):%Y%m%dT%H%M%S}.yaml", model, rig, recordings, figures
     )
@@ -149,13 +166,13 @@ def current(folder: str | Path) -> Path:
     """Return the calibration in use in a folder. Raises InputError when there is none."""
     marker = Path(folder) / "current"
     try:
-        name = marker.read_text(encoding="utf-8").strip()
-    except OSError:
+        name = marker.read_text(encoding="utf-8", errors="replace").strip()
+    except FileNotFoundError:
         raise InputError(f"{folder}: no calibration is current; make one with 'thermoctl identify'") from None
+    except OSError as e:
+        raise InputError(f"{marker}: cannot be read: {safe_file.reason(e)}; {_CHOOSE}") from None
     if not _NAME.fullmatch(name) or not (Path(folder) / name).is_file():
-        raise InputError(
-            f"{marker}: names '{name}', which is not there; 'thermoctl model rollback' chooses another"
-        )
+        raise InputError(f"{marker}: names {name[:90]!r}, which is not there; {_CHOOSE}")
     return Path(folder) / name
 
 
@@ -167,8 +184,8 @@ def history(folder: str | Path) -> list[Path]:
 def roll_back(folder: str | Path, name: str | None = None) -> Path:
     """Make an older calibration current: `name`, or the one before the present. It is checked first."""
     files = history(folder)
-    now = current(folder)
     if name is None:
+        now = current(folder)
         older = [p for p in files if p.name < now.name]
         if not older:
             raise InputError(

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
+from thermoctl.files.kept import reading
 from thermoctl.files.safe_file import write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.language import Plant
@@ -126,17 +127,12 @@ def write(folder: Path, plant: Plant, memory: Memory) -> None:
 def read(folder: Path, plant: Plant) -> Memory:
     """Read the memory of an earlier diagnosis of this plant. Raises InputError."""
     path = folder / FILE
-    try:
-        content = json.loads(path.read_text())
+    what, remedy = "the folder of an earlier diagnosis (its --out)", "diagnose all recordings again"
+    with reading(path, what, f"--continue cannot go on; {remedy}"):
+        content = json.loads(path.read_bytes())
         old_plant = content["plant"]
         past, straight = tuple(_past(h) for h in content["hypotheses"]), tuple(content.get("straight", ()))
         memory = Memory(past, tuple(content["recordings"]), straight)
-    except OSError:
-        raise InputError(
-            f"{path}: no such file; the folder of an earlier diagnosis (its --out) was expected (--continue)"
-        ) from None
-    except (ValueError, KeyError, TypeError) as e:
-        raise InputError(f"{path}: no memory of a diagnosis ({e}); diagnose all recordings again") from None
     if old_plant != stated(plant):
         raise InputError(
             f"{plant.file}: its free parameters or outputs are not those of {path}: a diagnosis goes on with the plant "
@@ -151,7 +147,7 @@ def _past(h: Mapping[str, Any]) -> Past:
             PlacedBefore(
                 (e["effect"], e["where"]),
                 e["label"],
-                e["values"],
+                {n: float(v) for n, v in e["values"].items()},
                 {n: (float(low), float(high)) for n, (low, high) in e["ranges"].items()},
             )
             for e in h["effects"]

@@ -21,7 +21,7 @@ import numpy as np
 from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.files.yamlfile import InputError
+from thermoctl.files.kept import reading
 from thermoctl.recording.dates import begun, line
 
 
@@ -80,21 +80,13 @@ def earlier_trends(earlier: Path | None) -> Sequence[dict[str, Any]]:
     path = earlier / "diagnosis.json" if earlier else None
     if path is None or not path.exists():
         return ()
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
+    with reading(path, "the result of a diagnosis", "diagnose all recordings again"):
+        result = json.loads(path.read_bytes())
         return [
             {k: str(t[k]) for k in ("effect", "where", "parameter")}
             | {"recordings": [_read_size(r) for r in t["recordings"]]}
             for t in result.get("trends", ())
         ]
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read: {e.strerror}") from None
-    # No JSON, or other content than a diagnosis writes.
-    except (ValueError, KeyError, TypeError, AttributeError) as e:
-        raise InputError(
-            f"{path}: damaged ({type(e).__name__}: {e}); the result of a diagnosis was expected; diagnose all "
-            "recordings again"
-        ) from None
 
 
 def _read_size(entry: Mapping[str, Any]) -> dict[str, Any]:
