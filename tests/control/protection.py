@@ -530,19 +530,23 @@ def idle_to_the_tick(module):
         bench.tick(command=arming.ARM).tick().tick(command=arming.DISARM).tick(3)
         assert bench.shown == set()
     bench = Bench(module, idle_current_a=0.5, idle_s=4 * P).warm().set(current_a=0.75).tick(3)
-    bench.set(current_a=0.5).tick()  # counts down
+    bench.set(current_a=0.5).tick(4)  # counts down at a quarter
     bench.set(current_a=0.75).tick(2)
     assert bench.shown == set()
     bench.tick().safe("coil_stuck_on")
     bench.tick(20).set(current_a=0.5).tick()  # however long it was
-    bench.tick(command=arming.DISARM).tick(3)
+    bench.tick(command=arming.DISARM).tick(15)
     assert bench.state == arming.READY and bench.shown == set()
     bench.set(current_a=0.75).tick(4)
     assert bench.shown == set()
     bench = Bench(module, idle_current_a=0.5, idle_s=4 * P).warm().tick(20)
     for _ in range(20):
-        bench.set(current_a=0.75).tick().set(current_a=0.5).tick()
+        bench.set(current_a=0.75).tick().set(current_a=0.5).tick(4)
     assert bench.state == arming.READY and bench.shown == set()
+    for _ in range(13):  # more than a fifth of the time: 1/4 of a tick stays of each round
+        bench.set(current_a=0.75).tick().set(current_a=0.5).tick(3)
+    assert bench.state == arming.READY and bench.shown == set()
+    bench.set(current_a=0.75).tick().safe("coil_stuck_on")
     bench = Bench(
         module, required=channels(0), idle_current_a=0.5, idle_s=4 * P, high=channels(math.inf, current_a=9.0)
     ).warm()

@@ -54,7 +54,11 @@ class Limits:
     )
     idle_power_w: float = option("largest coil power while the amplifier is disabled", 0.5, "W", 0.0, 1e5)
     idle_s: float = option(
-        "time by which idle_current_a or idle_power_w may be exceeded longer than not", 0.5, "s", 0.0, 60.0
+        "time for which idle_current_a or idle_power_w may be exceeded; without, it is counted down at a quarter",
+        0.5,
+        "s",
+        0.0,
+        60.0,
     )
     saturation_s: float = option(
         "longest time for which the drive may stay at control.output_limit", 0.5, "s", 0.0, 3600.0

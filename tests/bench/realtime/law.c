@@ -491,7 +491,7 @@ static void protect(law_t *l, int command, uint64_t external) {
         if (l->fresh[CURRENT]) l->idle_readings += 1.0;
         int driven = l->verdict[CURRENT] == 0.0 && l->idle_readings > 1.0
                      && (fabs(l->last[CURRENT]) > l->idle_current_a || fabs(l->power_w) > l->idle_power_w);
-        l->idle_s = fmax(0.0, fmin(l->idle_s, l->idle_limit_s) + (driven ? l->dt : -l->dt));
+        l->idle_s = fmax(0.0, fmin(l->idle_s, l->idle_limit_s) + (driven ? l->dt : -0.25 * l->dt));
         if (l->idle_s > l->idle_limit_s) found |= BIT(B_STUCK);
     }
     if (l->verdict[COIL] == 0.0 && l->last[COIL] > l->coil_limit_c) found |= BIT(B_HOT);
