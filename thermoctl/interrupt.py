@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -25,7 +26,9 @@ class Interrupted(KeyboardInterrupt):
 def raise_on_signals() -> None:
     """Let each of SIGNALS raise Interrupted; processes forked later end as usual.
 
-    nohup and a shell's background ignore SIGHUP and SIGINT; they stay ignored."""
+    nohup and a shell's background ignore SIGHUP and SIGINT; they stay ignored. After the last exit handler
+    all are ignored: Python would end by the signal then, though the command has done its work."""
+    atexit.register(_ignore)
     pid = os.getpid()
 
     def end(number: int, _: object) -> None:
@@ -42,6 +45,11 @@ def raise_on_signals() -> None:
     for number in SIGNALS:
         if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, end)
+
+
+def _ignore() -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager

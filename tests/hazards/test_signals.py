@@ -130,6 +130,23 @@ def test_a_signal_waits_until_a_process_that_starts_is_known():
     assert done.stdout.splitlines() == ["process known", "ended by SIGTERM"]
 
 
+LATE = """
+import os, signal, sys, thermoctl.interrupt as i
+i.raise_on_signals()
+class Late:
+    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.Signals[sys.argv[1]]):
+        kill(pid, number)
+late = Late()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_while_python_ends_changes_no_exit_status(name):
+    """The command has done its work: before, its status was -2 or -15 all the same."""
+    done = subprocess.run([sys.executable, "-c", LATE, name], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0 and not done.stderr
+
+
 def test_kill_9_of_a_test_costs_a_second_of_rows_and_it_goes_on(tmp_path):
     config, out = patient(rig_file(tmp_path)), tmp_path / "short.parquet"
     (tmp_path / "experiments.yaml").write_text(EXPERIMENT)
