@@ -5,6 +5,7 @@ timed is the arrival of the command at the drive, in several phases of its neigh
 """
 
 import contextlib
+import math
 import multiprocessing
 import os
 import socket
@@ -16,13 +17,13 @@ import psutil
 import pytest
 
 from tests.daemon.process import Daemon, wait
-from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, free_port, modbus_crc
+from tests.devices.emulators import ModbusLine, Port, SlcanAdapter, encode, free_port, modbus_crc
 from tests.devices.test_drives import AXIS_DBC, Drive, modbus
 from tests.hal.conftest import make_settings
 from tests.hazards.harness import ROWS, Row
 from tests.rigs.wire import HEAD, SENSED, TORQUE, WireRig
 from thermoctl.files import yamlfile
-from thermoctl_hal.base.backend import HardwareError
+from thermoctl_hal.base.backend import HardwareError, Sample
 from thermoctl_hal.modbus import link as links
 from thermoctl_hal.profiles.bind import bind
 from thermoctl_hal.rig.board import Board
@@ -362,30 +363,195 @@ def test_a_drive_that_another_master_or_its_gateway_spoils(tmp_path, case):
     ROWS.append(Row("Disarm", case, "0.5 s", figures, "amplifier off", f"`{fault}`"))
 
 
-@pytest.mark.slow
-def test_another_master_that_enables_a_disarmed_drive(tmp_path):
-    """It drives 0.5 A at 100 Hz. Each of our disabling messages ends that for 10 ms."""
-    rig, stop = Neighbours(tmp_path, [], "tcp"), threading.Event()
+def on_can(message, kind, *values, obeyed=True):
+    """Return what sends a frame of the drive's node on the bus, which the drive obeys, too."""
 
-    def drive():
-        while not stop.wait(0.01):
-            rig.axis.torque.request(8)
-            rig.axis.torque.feed(0.5)
+    def send(rig):
+        frame = (3 << 5 | message, False, struct.pack(kind, *values))
+        if obeyed:
+            rig.axis.take(frame)
+        rig.rig.can.send(encode(frame))
+
+    return send
+
+
+def on_rtu(*words):
+    """Return what sends a request on the Modbus line; the drive's unit answers its own."""
+
+    def send(rig):
+        body = struct.pack(">BBHH", *words)
+        rig.wire.send(body + modbus_crc(body) + rig.wire.take(body + modbus_crc(body)))
+
+    return send
+
+
+def colliding(rig):
+    """Let a second unit of the address answer at the same time."""
+    take = rig.wire.take
+    rig.wire.take = lambda data: bytes(byte & 0x5F for byte in take(data))
+
+
+OTHERS = {  # drive, what happens, how often (Hz, 0: once), the faults of which one is named first
+    "drive on CAN: another master disables it": ("", on_can(7, "<I", 1), 0, ["amplifier_stopped"]),
+    "drive on CAN: another master commands 1.5 A": ("", on_can(14, "<f", 1.5), 100, ["amplifier_error"]),
+    "drive on CAN: another node says that it is off": (
+        "",
+        on_can(1, "<IB3x", 0, 1, obeyed=False),
+        100,
+        ["amplifier_stopped"],
+    ),
+    "drive on CAN: another node says that it has a fault": (
+        "",
+        on_can(1, "<IB3x", 7, 8, obeyed=False),
+        100,
+        ["amplifier_fault"],
+    ),
+    "drive on Modbus RTU: another master disables it": (
+        "rtu",
+        on_rtu(3, 6, 100, 6),
+        0,
+        ["amplifier_stopped"],
+    ),
+    "drive on Modbus RTU: another master commands 1.5 A": (
+        "rtu",
+        on_rtu(3, 6, 101, 1500),
+        100,
+        ["amplifier_error", "following_error"],
+    ),
+    "drive on Modbus RTU: a second unit has its address": ("rtu", colliding, 0, ["amplifier_error"]),
+}
+
+
+@contextlib.contextmanager
+def repeated(act, rig, rate_hz):
+    """Act once, or at a rate until the end of the block."""
+    stop = threading.Event()
+
+    def run():
+        act(rig)
+        while rate_hz and not stop.wait(1.0 / rate_hz):
+            act(rig)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", OTHERS)
+def test_an_armed_drive_that_somebody_else_commands_or_answers_for(tmp_path, case):
+    servo, act, rate_hz, faults = OTHERS[case]
+    rig = Neighbours(tmp_path, [], servo)
+    with rig.stack:
+        rig.daemon.armed()
+        wait(lambda: rig.axis.torque.state == 8, "driven")
+        begin = time.monotonic()
+        with repeated(act, rig, rate_hz):
+            wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT")
+            fault_s = time.monotonic() - begin
+            wait(lambda: rig.axis.torque.state == 1, "off")
+            off_s = time.monotonic() - begin
+        found = rig.daemon.ask("status")["faults"]
+        fault = next(f["name"] for f in found if f["severity"] != "warning" and not f["follows"])
+    assert fault in faults
+    assert max(fault_s, off_s) < 0.55  # the drive's own watchdog: 0.6 s after the last command
+    figures = f"FAULT after {fault_s * 1e3:.0f} ms, disabled after {off_s * 1e3:.0f} ms"
+    often = f" at {rate_hz} Hz" if rate_hz else ""
+    ROWS.append(Row("Disarm", case + often, "0.55 s", figures, "amplifier off", f"`{fault}`"))
+
+
+@pytest.mark.slow
+def test_another_master_that_enables_a_disarmed_drive_on_can(tmp_path):
+    """The drive's readings are not taken any more: the rig stays SAFE, cannot be armed, and says who commands."""
+    rig = Neighbours(tmp_path, [], "")
+    with rig.stack:
+        begin = time.monotonic()
+        with repeated(lambda r: (on_can(7, "<I", 8)(r), on_can(14, "<f", 0.5)(r)), rig, 100):
+            wait(lambda: "amplifier_error" in str(rig.daemon.ask("status")["faults"]), "told", 2.0)
+            told_s, again = time.monotonic() - begin, rig.safe_s
+            assert "two masters would drive one axis" in str(rig.daemon.ask("status")["faults"])
+            assert not rig.daemon.ask("arm")["ok"]
+            _, repeated_s = wait(lambda: rig.safe_s > again, "the safe command again", 1.0)
+    ROWS.append(
+        Row(
+            "Disarm",
+            "drive on CAN, disarmed: another master enables it at 100 Hz",
+            "2 s",
+            f"told after {told_s * 1e3:.0f} ms",
+            f"SAFE; safe command repeated, the next after {repeated_s * 1e3:.0f} ms",
+            "`amplifier_error`",
+        )
+    )
+
+
+@pytest.mark.slow
+def test_a_disarm_waits_for_no_master_that_reads_all_the_time(tmp_path):
+    """Before, it waited for a pause of 0.1 s between the other master's requests, however long that took."""
+    rig = Neighbours(tmp_path, [], "rtu")
+    with rig.stack:
+        rig.daemon.armed()
+        wait(lambda: rig.axis.torque.state == 8, "driven")
+        rig.axis.torque.feed = lambda torque=None: setattr(rig.axis.torque, "fed_s", math.inf)  # no watchdog
+        with repeated(on_rtu(7, 4, 0, 2), rig, 33):
+            begin = time.monotonic()
+            rig.disarm()
+            wait(lambda: rig.safe_s > begin, "the safe command", 2.0)
+        disarm_s = rig.safe_s - begin
+    assert disarm_s < 0.4
+    case, figures = "drive on Modbus RTU: another master reads at 33 Hz", f"disarm {disarm_s * 1e3:.0f} ms"
+    ROWS.append(Row("Disarm", case, "400 ms", figures, "safe command at the drive", ""))
+
+
+@pytest.mark.parametrize("timeout_s", [0.05, 0.3])
+def test_a_drive_without_valid_answers_is_disabled_after_three_of_them(tmp_path, timeout_s):
+    """A reading, the command and the command of 0 wait for their answers; then comes the word that disables."""
+    drive, wire, profile, port, _ = modbus(tmp_path)
+    (tmp_path / "servo.yaml").write_text(profile.replace("timeout_s: 0.05", f"timeout_s: {timeout_s}"))
+    node = f"{{name: drive, profile: servo.yaml, port: '{port}', address: 3, roles: {{axis: amplifier_state, error: amplifier_fault}}}}"
+    device, honest, zero_s = driver(bind(yamlfile.loads(node), tmp_path)), wire.take, []
+    with contextlib.closing(wire):
+        device.connect()
+        drive.request(8)
+        sample = Sample(len(device.binding.channels.names))
+        device.poll(sample)
+        feed = drive.feed
+        drive.feed = lambda torque=None: (feed(torque), zero_s.append(time.monotonic()) if torque == 0 else 0)
+        wire.take = lambda data: honest(data)[:-1]
+        begin = time.monotonic()
+        device.poll(sample)
+        with contextlib.suppress(HardwareError):
+            device.write(0.5, True, time.monotonic())
+        device.disconnect()
+        assert drive.state == 1 and zero_s[0] - begin < 2 * timeout_s + 0.1
+        assert time.monotonic() - begin < 4 * timeout_s + 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("servo", ["rtu", "tcp"])
+def test_another_master_that_enables_a_disarmed_drive(tmp_path, servo):
+    """It drives 0.5 A at 100 Hz. Each of our disabling messages ends that for 10 ms."""
+    rig = Neighbours(tmp_path, [], servo)
+
+    def drive(rig):
+        rig.axis.torque.request(8)
+        rig.axis.torque.feed(0.5)
 
     with rig.stack:
-        begin, thread = time.monotonic(), threading.Thread(target=drive)
-        thread.start()
-        rig.stack.callback(thread.join)
-        rig.stack.callback(stop.set)
-        wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT", 8.0)
-        fault_s, again = time.monotonic() - begin, rig.safe_s
-        (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
-        _, repeated_s = wait(lambda: rig.safe_s > again, "the safe command again", 1.0)
+        begin = time.monotonic()
+        with repeated(drive, rig, 100):
+            wait(lambda: rig.daemon.ask("status")["state"] == "FAULT", "FAULT", 8.0)
+            fault_s, again = time.monotonic() - begin, rig.safe_s
+            (fault,) = [f["name"] for f in rig.daemon.ask("status")["faults"] if f["severity"] != "warning"]
+            _, repeated_s = wait(lambda: rig.safe_s > again, "the safe command again", 1.0)
     assert fault == "coil_stuck_on" and fault_s < 2.0
     ROWS.append(
         Row(
             "Disarm",
-            "drive on Modbus TCP, disarmed: another master enables it at 100 Hz",
+            f"drive on Modbus {servo.upper()}, disarmed: another master enables it at 100 Hz",
             "2 s",
             f"FAULT after {fault_s * 1e3:.0f} ms",
             f"safe command repeated, the next after {repeated_s * 1e3:.0f} ms",

@@ -10,7 +10,14 @@ _KINDS, _ORDERS = ("input", "holding", "discrete", "coil"), ("big", "little")
 MODBUS: dict[str, tuple[Key, ...]] = {
     "modbus": (
         whole("unit_id", "unit (binding: `address`); above 247 only on TCP", 0, 255, default=1),
-        number("timeout_s", "longest time for an answer", 0.01, 10, "s", default=0.3),
+        number(
+            "timeout_s",
+            "longest time for an answer; a drive without valid ones is disabled after three",
+            0.01,
+            10,
+            "s",
+            default=0.3,
+        ),
         whole("max_gap", "registers are read together over gaps of up to this many", 0, 100, default=8),
         whole("max_block", "registers read by one request, at most", 1, 125, default=100),
     ),

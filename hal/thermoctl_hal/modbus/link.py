@@ -266,9 +266,12 @@ class Link:
     def _drop(self) -> None:
         """Drop the bytes that came before this request, and the answer to another master.
 
+        It takes OTHERS_S at most: a command that disables must go out beside a master that never stops.
         Raises _Closed, OSError."""
-        last = b""
-        while select.select([self._line], [], [], OTHERS_S if self._is_rtu and _is_read(last) else 0.0)[0]:
+        last, end = b"", time.monotonic() + OTHERS_S
+        while (left := end - time.monotonic()) > 0.0:
+            if not select.select([self._line], [], [], left if self._is_rtu and _is_read(last) else 0.0)[0]:
+                return
             last = (last + self._take())[-READ_SIZE:]
 
     def _catch_up(self, request: _Request, timeout_s: float) -> None:
