@@ -131,6 +131,8 @@ JUMPS = (
         "control.setpoint_rate_um_s 16.6667 -> 1e+06",
     ),
     ("slew_um_s: 1\n", "slew_um_s: 1e4\n", "compensation.slew_um_s 1 -> 10000"),
+    ("setpoint_high_um: 250", "setpoint_high_um: 2", "high_um -250..2, the setpoint is 3 now"),
+    ("setpoint_low_um: -250", "setpoint_low_um: 4", "high_um 4..250, the setpoint is 3 now"),
 )
 
 

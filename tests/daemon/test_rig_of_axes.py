@@ -162,7 +162,7 @@ def test_a_reload_that_one_axis_refuses_changes_no_axis(running, capsys):
     path, rig = running
     good, log = path.read_text(), path.parent / "rig.log"
     bad = [
-        ("kp: 0.001}", "kp: 0.01}", "the output of the armed rig would jump"),
+        ("kp: 0.001}", "kp: 0.01}", "the output of the armed rig would move"),
         ("kp: 0.001}", "kp: -1}", "control.kp"),
     ]
     for old, new, why in bad:

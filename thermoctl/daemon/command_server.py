@@ -200,9 +200,14 @@ class Commands:
         found, drive = jumps(old, new), abs(row[AT["control_v"]])
         if drive > new.output_limit:
             found.append(f"control.output_limit {new.output_limit:g}, the drive is {drive:g} now")
+        setpoint, low, high = row[AT["setpoint_um"]], new.setpoint_low_um, new.setpoint_high_um
+        if not low <= setpoint <= high:
+            found.append(
+                f"control.setpoint_low_um..high_um {low:g}..{high:g}, the setpoint is {setpoint:g} now"
+            )
         if found:
             raise InputError(
-                f"{self.settings.path}: nothing was changed, the output of the armed rig would jump: "
+                f"{self.settings.path}: nothing was changed, the output of the armed rig would move: "
                 f"{'; '.join(found)}. While ARMED a reload changes each by a factor of {LIVE_STEP:g} at most: go in "
                 "steps, or disarm first"
             )
