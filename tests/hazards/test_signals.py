@@ -11,6 +11,7 @@ import sys
 import time
 
 import numpy as np
+import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -45,6 +46,11 @@ COMMANDS = {
         "",
         "thermoctl: recordings export: ended by SIGTERM",
     ),
+    "fleet": (
+        ["fleet", "rigs", "--plant", HEATER / "plant.yaml", "--workers", "2"],
+        "",
+        "thermoctl: fleet: ended by SIGTERM",
+    ),
     "start": (["start", "--config", "rig.yaml"], "", "thermoctl: start: ended by SIGTERM"),
 }
 """Words of each command, what it prints before the signal ('': see `is_begun`), and its last line."""
@@ -77,6 +83,8 @@ def folder(tmp_path):
     rows = np.arange(600_000)
     columns = {"t_s": rows * 1e-3, **{f"a{k}": np.sin(rows + k) for k in range(12)}}
     pq.write_table(pa.table(columns), tmp_path / "long.parquet")
+    (tmp_path / "rigs/a").mkdir(parents=True)
+    (tmp_path / "rigs/a/run_1.csv").write_bytes((HEATER / "run_1.csv").read_bytes())
     return tmp_path
 
 
@@ -84,6 +92,8 @@ def is_begun(name, folder, said):
     """Return whether a command is at work."""
     if name == "export":
         return any(folder.glob(".long.csv.*.part"))
+    if name == "fleet":  # a process of its cluster has just begun
+        return len(psutil.Process().children(recursive=True)) > 1
     if name == "start":
         return any(folder.glob("*.log"))
     return COMMANDS[name][1] in said

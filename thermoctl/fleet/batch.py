@@ -10,7 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from thermoctl.extras import load
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job, Run, done
+from thermoctl.interrupt import held
 
 RETRIES = 3  # number of workers that may die on one case before it counts as failed
 
@@ -69,30 +70,29 @@ def _dask() -> tuple[Any, Any]:
 def cluster(scheduler: str | None, workers: int | None) -> Iterator[Any]:
     """Open a Dask client of the scheduler at the address, else of local single-threaded processes."""
     dask, distributed = _dask()
-
-    with dask.config.set(
-        {
-            "distributed.scheduler.allowed-failures": RETRIES,
-            "distributed.worker.daemon": False,
-            "distributed.comm.timeouts.connect": "60s",
-        }
-    ):
-        if scheduler:
-            with distributed.Client(scheduler) as client:
-                yield client
-            return
-        with (
-            distributed.LocalCluster(
-                n_workers=workers or os.cpu_count(),
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address="127.0.0.1:0",
-                memory_limit=0,
-                silence_logs=50,
-            ) as local,
-            distributed.Client(local) as client,
-        ):
+    options = {
+        "distributed.scheduler.allowed-failures": RETRIES,
+        "distributed.worker.daemon": False,
+        "distributed.comm.timeouts.connect": "60s",
+    }
+    with dask.config.set(options), ExitStack() as opened:
+        try:
+            with held():  # a half-made cluster cannot be closed
+                address = scheduler or opened.enter_context(
+                    distributed.LocalCluster(
+                        n_workers=workers or os.cpu_count(),
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address="127.0.0.1:0",
+                        memory_limit=0,
+                        silence_logs=50,
+                    )
+                )
+                client = opened.enter_context(distributed.Client(address))
             yield client
+        finally:
+            with held():
+                opened.close()
 
 
 def run_all(

@@ -52,7 +52,8 @@ def fleet(
     paths = find_recordings(folder)
     if workers or scheduler:
         with cluster(scheduler, workers) as client:
-            summaries = client.gather([client.submit(summarise, p, plant, names, pure=False) for p in paths])
+            futures = [client.submit(summarise, p, plant, names, pure=False) for p in paths]
+            summaries = [future.result() for future in futures]
     else:
         summaries = [summarise(p, plant, names) for p in paths]
     rigs = judge(summaries)
