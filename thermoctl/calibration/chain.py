@@ -15,6 +15,7 @@ from scipy import linalg, signal
 
 from thermoctl.calibration.recorded import Recorded
 from thermoctl.control.model import CompensatorModel
+from thermoctl.files.yamlfile import InputError
 from thermoctl.identify import expansion, filter, modal
 from thermoctl.identify.statespace import StateSpace
 
@@ -69,7 +70,12 @@ def identify(tests: list[Recorded], order: int | None) -> StateSpace:
     """Identify a real-pole model from all tests together, without the effect of the air's changes.
 
     A change of the air shifts every rise by C b_air. This effect is simulated with the model of the previous
-    round and subtracted. `order` None: selected by BIC in the last round."""
+    round and subtracted. `order` None: selected by BIC in the last round.
+    Raises InputError where no test heats."""
+    if not any(np.ptp(t.power_w) > 0.0 for t in tests):
+        raise InputError(
+            "power_w is constant in all recordings: tests that heat the coil and let it cool were expected"
+        )
     moved: list[np.ndarray] | list[float] = [0.0] * len(tests)
     for round_, now in enumerate((order or FIRST_ORDER, order or FIRST_ORDER, order)):
         pairs = zip(tests, moved, strict=True)

@@ -29,6 +29,7 @@ KEEP_S = 1.0
 """Wall time between two writes of the rows of a running test.
 
 A block of rows, 100 s of a simulated rig, is written at once."""
+LARGEST = 1e9  # a larger reading is no um, degC or W: a fit would take it for everything
 SETTLED = 5  # first samples, whose mean error is the origin of the thermal growth
 
 
@@ -67,13 +68,21 @@ def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray], points: Sequenc
 def read(path: str | Path, points: Sequence[str]) -> Recorded:
     """Read a recording of a rig with these points at 1 s; gaps in power and air are held.
 
-    Raises InputError when a signal is missing."""
+    Raises InputError when a signal is missing, has no reading, or one that none of its kind can be."""
     table = read_table(path)
     names = (*EVERY_RIG, *(f"{p}_c" for p in points))
     for n in names:
         if n not in table.columns:
             raise InputError(
                 f"{path}: column '{n}' is missing{suggest(n, table.columns)}; a calibration needs it"
+            )
+        largest = np.nanmax(np.abs(table.columns[n]), initial=-1.0)
+        least = -1.0 if n == "output_reference_um" else 0.0  # the output may be measured in some tests only
+        if not least <= largest < LARGEST:
+            found = "no reading" if largest < 0.0 else f"{largest:g}"
+            raise InputError(
+                f"{path}: column '{n}': {found}; readings below {LARGEST:g} were expected: correct the channel's profile, or "
+                "leave the cell empty"
             )
     since = table.t - table.t[0]
     t = np.arange(np.floor(since[-1]) + 1)
