@@ -229,6 +229,25 @@ def test_a_wrong_map_is_refused_with_its_line(tmp_path, text, says):
         load(path, tmp_path / "map.yaml")
 
 
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        (rb' derivative="\d+"', b""),
+        (rb' max="[^"]*"', b' max="much"'),
+        (rb'valueReference="', b'valueReference="9'),
+    ],
+)
+def test_a_damaged_description_ends_in_one_line(tmp_path, old, new):
+    path = tmp_path / "damaged.fmu"
+    write(load(HEATER / "plant.yaml"), "fmu", tmp_path / "good.fmu")
+    with zipfile.ZipFile(tmp_path / "good.fmu") as good, zipfile.ZipFile(path, "w") as packed:
+        for item in good.infolist():
+            data = good.read(item)
+            packed.writestr(item, re.sub(old, new, data) if item.filename.endswith(".xml") else data)
+    with pytest.raises(InputError, match=r"damaged.fmu: no usable FMU \(\w+: .*\); export it anew"):
+        load(path)
+
+
 def test_what_is_no_usable_fmu_is_said(heater, tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load(tmp_path / "none.fmu")

@@ -223,7 +223,13 @@ def opened(path: str) -> Fmu:
 
 @cache
 def _opened(path: Path, changed: int) -> Fmu:
-    return Fmu(path, _description(path))
+    try:
+        return Fmu(path, _description(path))
+    except InputError:
+        raise
+    except Exception as e:  # FMPy raises bare Exceptions
+        said = " ".join(str(e).split())[:300]
+        raise InputError(f"{path}: no usable FMU ({type(e).__name__}: {said}); export it anew") from None
 
 
 def _description(path: Path) -> ModelDescription:
