@@ -97,6 +97,35 @@ def test_a_wrong_file_gives_one_error_with_its_line(folder, capsys, change, word
     assert "bad.yaml:" in str(e.value)
 
 
+@pytest.mark.parametrize(
+    "parts, words",
+    [
+        ("[{hold: 5}]", "hold: a list was expected, found 5"),
+        ("[{hold: [5]}]", "seconds, um. was expected"),
+        ("[{hold: [[1, 0]], more: 1}]", "a part: unknown key 'more'"),
+        (
+            "[{trapezoid: {low_um: 0, high_um: 9, hold_s: 3, duration_s: 60}}]",
+            "hold_s: a list was expected, found 3",
+        ),
+        (
+            "[{trapezoid: {low_um: 9, high_um: 9, hold_s: [0], duration_s: 60}}]",
+            "hold_s: seconds were expected that fill duration_s",
+        ),
+        (
+            "[{repeat: 1000, parts: [{repeat: 1000, parts: [{hold: [[1, 0], [1, 5]]}]}]}]",
+            "more than 100000 corners up to here",
+        ),
+    ],
+)
+def test_a_wrong_part_is_refused_at_its_line(tmp_path, parts, words):
+    """A trapezoid that neither moves nor holds never ended."""
+    path = tmp_path / "experiments.yaml"
+    head = "format: thermoctl-experiments/1\nrate_um_s: 10\nexperiments:\n  short: {title: t, parts: "
+    path.write_text(f"{head}{parts}}}\n")
+    with pytest.raises(InputError, match=rf"experiments.yaml:4:\d+: .*{words}"):
+        load_experiments(path)
+
+
 def test_on_the_simulated_back_end_it_runs_under_the_daemons_protections(
     folder, capsys, monkeypatch, request
 ):

@@ -21,6 +21,7 @@ import numpy as np
 from thermoctl.files.yamlfile import InputError, Node, Section, load
 
 FORMAT = "thermoctl-experiments/1"
+MAX_CORNERS = 100_000  # largest number of corners of a schedule: no person wrote more
 SETPOINT = "setpoint_um"
 
 
@@ -130,7 +131,7 @@ def _inputs(name: str, node: Node) -> Inputs:
     if not isinstance(assumed, dict):
         raise e["assumed"].error("a mapping of columns to numbers was expected")
     predicted = {}
-    for column, entry in (e["predicted"].value if "predicted" in e else {}).items():
+    for column, entry in Section(e["predicted"], "predicted").node.value.items() if "predicted" in e else ():
         if not isinstance(entry.value, list) or len(entry.value) != 2:
             raise entry.error(f"predicted '{column}': [lowest, highest] was expected")
         low, high = (_number(v, -1e12, 1e12) for v in entry.value)
@@ -177,6 +178,8 @@ def _parts(node: Node, rate: float, corners: list[tuple[float, float]]) -> None:
         if kind is None:
             raise part.error(f"a part is one of {', '.join(_PARTS)}")
         _PARTS[kind](part, rate, corners)
+        if len(corners) > MAX_CORNERS:
+            raise part.error(f"more than {MAX_CORNERS} corners up to here: fewer repetitions were expected")
 
 
 def _repeat(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
@@ -186,7 +189,8 @@ def _repeat(part: Node, rate: float, corners: list[tuple[float, float]]) -> None
 
 
 def _holds(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
-    for pair in _keys(part, "a part", {"hold"})["hold"].value:
+    _keys(part, "a part", {"hold"})
+    for pair in Section(part, "a part").list("hold"):
         if not isinstance(pair.value, list) or len(pair.value) != 2:
             raise pair.error("[seconds, um] was expected")
         _hold(corners, _number(pair.value[0], 0, 1e6), _number(pair.value[1], -1e6, 1e6), rate)
@@ -195,7 +199,12 @@ def _holds(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
 def _trapezoid(part: Node, rate: float, corners: list[tuple[float, float]]) -> None:
     z = _keys(part.value["trapezoid"], "trapezoid", {"low_um", "high_um", "hold_s", "duration_s"})
     low, high, duration = (_number(z[k], -1e6, 1e6) for k in ("low_um", "high_um", "duration_s"))
-    holds = [_number(h, 0, 1e6) for h in z["hold_s"].value]
+    holds = [_number(h, 0, 1e6) for h in Section(part.value["trapezoid"], "trapezoid").list("hold_s")]
+    once = 2 * sum(holds) + 2 * len(holds) * abs(high - low) / rate
+    if once * MAX_CORNERS < duration:
+        raise z["hold_s"].error(
+            f"hold_s: seconds were expected that fill duration_s within {MAX_CORNERS} turns"
+        )
     end = corners[-1][0] + duration
     for hold in cycle(holds):
         if corners[-1][0] + 2 * hold + 2 * abs(high - low) / rate > end + 1e-9:
