@@ -19,6 +19,7 @@ def test_a_warm_start_refuses_the_estimates_of_another_model(tmp_path, field):
     model = TWO if field == "sensors" else ONE
     value = getattr(model, field)
     told = {"kind": "mkf", "sensors": (0, 2), "points": tuple(f"p{k}" for k in range(len(ONE.points)))}
+    told["A_minus_I"] = ONE.A_minus_I / 2  # stable, too
     other = told[field] if field in told else value + 0.25
     path = tmp_path / "kept.state"
     state = np.arange(5.0)
