@@ -40,7 +40,7 @@ def test_sketched_products_are_those_of_the_rows(chain):
     groups = [g for c in found for g in groups_of(c, metric)]
     columns = [column for g in groups for column in g.columns()]
     (sketched,) = products([metric], at, columns)
-    rows = np.concatenate([part for _, part in directions(metric, at, columns)], axis=1)
+    rows = np.concatenate([part for _, part in directions(metric, at, groups)], axis=1)
     whole = rows * metric.weight[:, None]
     rows = metric.project(whole)
     size = np.linalg.norm(rows, axis=0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,10 @@ from thermoctl.diagnosis.evidence.noise import Averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.diagnosis.search.gains import NEAR, Column, parameter_values
+from thermoctl.diagnosis.search.gains import NEAR, parameter_values
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.diagnosis.search.overlay import Trajectory
-from thermoctl.diagnosis.search.screen import Norms, directions, groups_of
+from thermoctl.diagnosis.search.screen import Group, Norms, directions, groups_of, projected
 
 SEEN = 5.0  # an effect shows if its size is this many standard errors
 ABSORBED = 1e-4  # an effect is imitated if the projection leaves less than this share of its direction's norm
@@ -86,8 +87,7 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     rig = case.rig(null.rough_plant, metric.drives)
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
-    columns = (column for c in placed for g in groups_of(c, metric) for column in g.columns())
-    return _best(_norms(metric, trajectories, columns))
+    return _best(_norms(metric, trajectories, (g for c in placed for g in groups_of(c, metric))))
 
 
 Rms = Mapping[str, tuple[float, float]]
@@ -116,16 +116,15 @@ def _moves(rms: Rms, times: float) -> tuple[str, float, float]:
 
 
 def _norms(
-    metric: Metric, trajectories: Sequence[Trajectory], columns: Iterable[Column]
+    metric: Metric, trajectories: Sequence[Trajectory], groups: Iterable[Group]
 ) -> Iterator[tuple[Norms, Rms]]:
     readings = np.concatenate([d.y for d in metric.drives])
     names = metric.model.outputs
-    for part, plain in directions(metric, trajectories, columns):
-        rows = plain * metric.weight[:, None]
-        full = np.linalg.norm(rows, axis=0)
-        left = np.linalg.norm(metric.project(rows), axis=0)
+    for part, plain in directions(metric, trajectories, groups):
+        full, rows = projected(metric, plain)
+        left = np.linalg.norm(rows, axis=0)
         energy = _energies(metric, plain)
-        for k, (column, whole, size) in enumerate(zip(part, full, left, strict=True)):
+        for k, (column, whole, size) in enumerate(zip(chain.from_iterable(part), full, left, strict=True)):
             rms = {
                 names[j]: (float(e[k] / np.isfinite(readings[:, j]).sum()) ** 0.5, span)
                 for j, e in energy.items()

@@ -6,24 +6,23 @@ from the present residual and metric. Only the directions with the largest gains
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from thermoctl.diagnosis.search.gains import Column, Direction, score
+from thermoctl.diagnosis.search.gains import Column, Direction, scores
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
-from thermoctl.diagnosis.search.screen import Group
+from thermoctl.diagnosis.search.screen import Group, projected
+from thermoctl.diagnosis.search.screen import chunks as chunks  # law/propose.py, too, has it from here
 from thermoctl.diagnosis.search.sketch import foremost_groups
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
 KEPT = 288  # columns that are simulated again, at most
 LIKE = 0.1  # largest change of an output, over its swing, for which the plant moves as before
 CHUNK = 480  # columns whose rows are whitened together
-
-T = TypeVar("T")
 
 
 @dataclass
@@ -39,14 +38,14 @@ class Known:
     sizes: list[np.ndarray] = field(default_factory=list)
     count: int = 0
 
-    def add(self, columns: Sequence[Column], rows: np.ndarray) -> None:
-        """Add columns and their rows (rows, k), not whitened."""
+    def add(self, groups: Sequence[Sequence[Column]], rows: np.ndarray) -> None:
+        """Add groups of columns and their rows (rows, k), not whitened."""
         size = np.linalg.norm(rows, axis=0)
         self.rows.append((rows / np.where(size > 0, size, 1.0)).astype(np.float16))
         self.sizes.append(size)
-        for k, column in enumerate(columns):
-            self.place.setdefault(_name(column.candidate, column.group), self.count + k)
-        self.count += len(columns)
+        for columns in groups:
+            self.place.setdefault(_name(columns[0].candidate, columns[0].group), self.count)
+            self.count += len(columns)
 
     def like(self, metric: Metric) -> bool:
         """Return whether the plant's outputs are nearly those of the first screening."""
@@ -63,8 +62,10 @@ class Known:
         flat, sizes = np.concatenate(self.rows, axis=1), np.concatenate(self.sizes)
         found: list[Direction | None] = []
         known = [g for g in groups if self._columns(g) is not None]
-        for at_once in chunks(known, lambda g: len(g.sizes), CHUNK):
-            found += self._scored(metric, flat, sizes, at_once)
+        for part in chunks(known, lambda g: len(g.sizes), CHUNK):
+            ks = [k for g in part for k in self._columns(g) or ()]
+            full, rows = projected(metric, flat[:, ks].astype(float) * sizes[ks])
+            found += scores([list(g.columns()) for g in part], rows, metric.residual @ rows, full)
         kept = foremost_groups(known, found, KEPT)
         return [g for g in groups if self._columns(g) is None] + [known[i] for i in sorted(kept)]
 
@@ -72,34 +73,6 @@ class Known:
         """Return the positions of a group's columns; None if they are not known."""
         first = self.place.get(_name(g.candidate, g.number))
         return None if first is None else range(first, first + len(g.sizes))
-
-    def _scored(
-        self, metric: Metric, flat: np.ndarray, sizes: np.ndarray, groups: Sequence[Group]
-    ) -> list[Direction | None]:
-        """Return the direction of each group by the rows that are known."""
-        ks = [k for g in groups for k in self._columns(g) or ()]
-        rows = flat[:, ks].astype(float) * sizes[ks] * metric.weight[:, None]
-        full = np.linalg.norm(rows, axis=0)
-        rows = metric.project(rows)
-        products, out, start = metric.residual @ rows, list[Direction | None](), 0
-        for g in groups:
-            part = slice(start, start := start + len(g.sizes))
-            best = dict[int, Direction]()
-            score(list(g.columns()), rows[:, part], products[part], full[part], best)
-            out.append(next((d for d in best.values() if d.gain > 0), None))
-        return out
-
-
-def chunks(items: Iterable[T], size: Callable[[T], int], least: int) -> Iterator[list[T]]:
-    """Yield the items in lists whose sizes sum to `least` or more; the last one may be smaller."""
-    part: list[T] = []
-    for item in items:
-        part.append(item)
-        if sum(map(size, part)) >= least:
-            yield part
-            part = []
-    if part:
-        yield part
 
 
 def _name(candidate: Any, number: Any) -> tuple[Any, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transform
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
-from thermoctl.diagnosis.search.gains import Column, Direction, score
+from thermoctl.diagnosis.search.gains import Column, Direction, scores
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import groups_of
@@ -50,18 +50,16 @@ def fine(
         return np.concatenate([(transform(k, e[k.recording])[-len(w) :].T * w).T for k, w in own])
 
     residual = rows([d.y[:, j] - run.y[:, j] for d, run in zip(metric.drives, metric.runs, strict=True)])
-    best: dict[int, Direction] = {}
+    found: list[Direction | None] = []
     groups = groups_of(c, metric)
     for some in (groups[k : k + TOGETHER] for k in range(0, len(groups), TOGETHER)):
         each = [list(g.columns()) for g in some]
         columns = list(chain.from_iterable(each))
         d = rows([_changed(columns, at, j) for at in trajectories])
-        edges = np.cumsum([len(one) for one in each])[:-1]
         # all columns at once: a few that lie apart in memory take several times as long
-        parts = (np.split(x, edges, axis=-1) for x in (d, d.T @ residual, np.linalg.norm(d, axis=0)))
-        for one, x, g, full in zip(each, *parts, strict=True):
-            score(one, x, g, full, best)
-    return [dataclasses.replace(d, vector=None) for d in best.values() if d.gain > 0]
+        found += scores(each, d, d.T @ residual, np.linalg.norm(d, axis=0))
+    best = min(filter(None, found), key=lambda d: d.log_p, default=None)
+    return [dataclasses.replace(best, vector=None)] if best and best.gain > 0 else []
 
 
 def _changed(columns: Sequence[Column], at: Trajectory, j: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -72,14 +71,13 @@ def log_p(gain: float, dims: int) -> float:
 class Column:
     """The recipe of a direction: an effect at one shape, along one direction `dim` of its amplitudes.
 
-    `group`: its group of the candidate; `count`: number of columns in it. `values`: the plant's parameters
-    with a small amplitude; `scale`: the factor from the change at this amplitude to that at amplitude 1."""
+    `group`: its group of the candidate. `values`: the plant's parameters with a small amplitude; `scale`: the
+    factor from the change at this amplitude to that at amplitude 1."""
 
     candidate: Candidate
     group: Any
     shape: dict[str, float]
     dim: tuple[float, ...]
-    count: int
     overlay: Callable[[], Overlay]
     values: Mapping[str, float]
     scale: float
@@ -122,22 +120,28 @@ def parameter_values(c: Candidate, shape: Mapping[str, float], s: Sequence[float
     return out
 
 
-def score(
-    columns: Sequence[Column], rows: np.ndarray, g: np.ndarray, full: np.ndarray, best: dict[int, Direction]
-) -> None:
-    """Score the columns of one group, and keep their best direction if it is the candidate's best so far.
+def scores(
+    groups: Sequence[Sequence[Column]], rows: np.ndarray, g: np.ndarray, full: np.ndarray
+) -> list[Direction | None]:
+    """Return the best direction of each group of columns; None where the unknowns absorb all of them.
 
     - `rows` (rows, k): the columns after projection, or sketches with about the same inner products
     - `g` (k,): products of the columns with the residual; `full` (k,): norms of the columns before
       projection"""
+    edges = np.cumsum([len(columns) for columns in groups])[:-1]
+    parts = (np.split(x, edges, axis=-1) for x in (rows, g, full))
+    return [_score(*part) for part in zip(groups, *parts, strict=True)]
+
+
+def _score(columns: Sequence[Column], rows: np.ndarray, g: np.ndarray, full: np.ndarray) -> Direction | None:
+    """Return the best direction of the columns of one group; arguments as of `scores`."""
     c, m = columns[0].candidate, rows.T @ rows
     if "windows" in c.effect.shapes.values():
-        _score_windows(columns, rows, full, g, m, best)
-        return
+        return _score_windows(columns, rows, full, g, m)
     left = np.sqrt(np.maximum(np.diag(m), 0)) / np.maximum(full, 1e-300)
     useful = (left > 1e-4) & (full > 1e-9)
     if not useful.any():
-        return
+        return None
     scale = np.where(useful, np.sqrt(np.maximum(np.diag(m), 1e-300)), 1.0)
     sub = m[np.ix_(useful, useful)] / np.outer(scale[useful], scale[useful])
     coefficient = np.zeros(len(g))
@@ -153,7 +157,7 @@ def score(
     if len(g) == 1 and not _possible(columns[0], float(coefficient[0])):
         gain = 0.0
     shape, s = _sizes(columns, coefficient)
-    _keep(best, Direction(c, shape, gain, int(useful.sum()), {}), s, lambda: rows @ coefficient)
+    return _direction(c, shape, gain, int(useful.sum()), s, rows @ coefficient)
 
 
 def _plausible(columns: Sequence[Column], coefficient: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -227,14 +231,9 @@ def _sizes(columns: Sequence[Column], coefficient: np.ndarray) -> tuple[dict[str
 
 
 def _score_windows(
-    columns: Sequence[Column],
-    rows: np.ndarray,
-    full: np.ndarray,
-    g: np.ndarray,
-    m: np.ndarray,
-    best: dict[int, Direction],
-) -> None:
-    """Keep the best pair of a start and an end. An end after the last column is the end of the recording."""
+    columns: Sequence[Column], rows: np.ndarray, full: np.ndarray, g: np.ndarray, m: np.ndarray
+) -> Direction | None:
+    """Return the best pair of a start and an end; after the last column, that is the recording's end."""
     edges = [q.shape["start"] for q in columns]
     last, floor = len(edges), 1e-12 * float(full.max()) ** 2
     gain, window = -1.0, (0, 0, 0.0)
@@ -245,7 +244,7 @@ def _score_windows(
             if bottom > floor and top * top / bottom > gain:
                 gain, window = top * top / bottom, (a, b, top / bottom)
     if gain < 0:
-        return
+        return None
     a, b, amplitude = window
     # Heat that ends and a lack of heat that starts differ by a constant, which parameters absorb.
     # The lack is likelier.
@@ -254,7 +253,7 @@ def _score_windows(
         gain = g[a] ** 2 / m[a, a]
     shape = {"start": edges[a], "end": edges[b] if b < last else 10 * edges[-1]}
     vector = rows[:, a] - (rows[:, b] if b < last else 0)
-    _keep(best, Direction(columns[0].candidate, shape, gain, 1, {}), [amplitude], lambda: vector)
+    return _direction(columns[0].candidate, shape, gain, 1, [amplitude], vector)
 
 
 def _allowed(p: EffectParameter, coefficient: float) -> bool:
@@ -267,19 +266,22 @@ def _allowed(p: EffectParameter, coefficient: float) -> bool:
     )
 
 
-def _keep(
-    best: dict[int, Direction], new: Direction, sizes: Sequence[float], along: Callable[[], np.ndarray]
-) -> None:
-    """Keep a direction if it is its candidate's best so far. Only then `along` computes its rows."""
-    shape = {k: v for k, v in new.shape.items() if k != "picked_from"}
-    new = dataclasses.replace(new, elsewhere=float(np.log10(new.shape.get("picked_from", 1.0))))
-    old = best.get(id(new.candidate))
-    if old is None or new.log_p < old.log_p:
-        vector = along()
-        size = float(np.linalg.norm(vector))
-        best[id(new.candidate)] = dataclasses.replace(
-            new,
-            shape=shape,
-            start=parameter_values(new.candidate, new.shape, sizes),
-            vector=(vector / size).astype(np.float32) if size > 0 else None,
-        )
+def _direction(
+    c: Candidate,
+    shape: Mapping[str, float],
+    gain: float,
+    dims: int,
+    sizes: Sequence[float],
+    along: np.ndarray,
+) -> Direction:
+    """Return the direction of a candidate at a shape, whose rows are `along`."""
+    size = float(np.linalg.norm(along))
+    return Direction(
+        c,
+        {k: v for k, v in shape.items() if k != "picked_from"},
+        gain,
+        dims,
+        parameter_values(c, shape, sizes),
+        (along / size).astype(np.float32) if size > 0 else None,
+        float(np.log10(shape.get("picked_from", 1.0))),
+    )

@@ -18,34 +18,46 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from thermoctl.diagnosis.evidence.onsets import ONSETS
 from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, score
+from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, scores
 from thermoctl.diagnosis.search.metric import Metric, Pushed
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.diagnosis.search.shapes import COARSER, shape_grid
 from thermoctl.plant.fitting.cores import ABREAST, each
 
 EPSILON = 1e-4  # amplitude of an effect at which its first-order change is computed
-CHUNK = 96
+CHUNK = 96  # columns that are simulated at a time
 
-
-Entry = tuple[Column, np.ndarray, float]  # a column, its rows after projection, its norm before
+T = TypeVar("T")
 
 
 def directions(
-    metric: Metric, trajectories: Sequence[Trajectory], columns: Iterable[Column]
-) -> Iterator[tuple[Sequence[Column], np.ndarray]]:
-    """Yield rows (rows, k) of columns, not whitened, a chunk at a time."""
-    left = iter(columns)
-    while parts := [p for _ in range(ABREAST) if (p := list(itertools.islice(left, CHUNK)))]:
-        rows = each(lambda p: metric.responses(partial(_pushed, p, trajectories), len(p)), parts)
+    metric: Metric, trajectories: Sequence[Trajectory], groups: Iterable[Group]
+) -> Iterator[tuple[list[list[Column]], np.ndarray]]:
+    """Yield the columns of some groups, by group, and their rows (rows, k), not whitened."""
+    left = chunks((list(g.columns()) for g in groups), len, CHUNK)
+    while parts := list(itertools.islice(left, ABREAST)):
+        flat = [list(itertools.chain.from_iterable(part)) for part in parts]
+        rows = each(lambda p: metric.responses(partial(_pushed, p, trajectories), len(p)), flat)
         yield from zip(parts, rows, strict=True)
+
+
+def chunks(items: Iterable[T], size: Callable[[T], int], least: int) -> Iterator[list[T]]:
+    """Yield the items in lists whose sizes sum to `least` or more; the last one may be smaller."""
+    part: list[T] = []
+    for item in items:
+        part.append(item)
+        if sum(map(size, part)) >= least:
+            yield part
+            part = []
+    if part:
+        yield part
 
 
 def _pushed(part: Sequence[Column], trajectories: Sequence[Trajectory], r: int) -> Pushed:
@@ -70,7 +82,13 @@ class Norms:
     left: float
 
 
-Keep = Callable[[Sequence[Column], np.ndarray], None]
+def projected(metric: Metric, plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the norms (k,) of whitened rows, and these rows (rows, k) after projection."""
+    rows = plain * metric.weight[:, None]
+    return np.linalg.norm(rows, axis=0), np.asfortranarray(metric.project(rows))
+
+
+Keep = Callable[[Sequence[Sequence[Column]], np.ndarray], None]
 Select = Callable[[Sequence[Metric], Sequence[Trajectory], list["Group"]], list["Group"]]
 
 
@@ -87,7 +105,7 @@ def screen(
 
     The metrics share a fit and differ only in their weights. `edges`: onsets to try instead of the grid.
     `select` chooses the groups that are simulated (sketch.py, again.py). If it chooses all, the norms of the
-    columns in the first metric are appended to `norms`. Then `keep` receives the columns and their rows."""
+    columns in the first metric are appended to `norms`. Then `keep` receives groups of columns with rows."""
     first = metrics[0]
     trajectories = [Trajectory(first, rig, r) for r in range(len(first.drives))]
     groups = [g for c in placed for g in groups_of(c, first, edges)]
@@ -95,25 +113,18 @@ def screen(
     if len(groups) < every:
         norms = None
     best: list[dict[int, Direction]] = [{} for _ in metrics]
-    pending: dict[tuple[Any, ...], list[Entry]] = {}
-    columns = (column for g in groups for column in g.columns())
-    for part, plain in directions(first, trajectories, columns):
+    for part, plain in directions(first, trajectories, groups):
         if norms is not None and keep:
             keep(part, plain)
         for metric, leaders in zip(metrics, best, strict=True):
-            rows = plain * metric.weight[:, None]
-            full = np.linalg.norm(rows, axis=0)
-            rows = metric.project(rows)
+            full, rows = projected(metric, plain)
             if metric is first and norms is not None:
-                left = np.linalg.norm(rows, axis=0)
-                norms += [Norms(*n) for n in zip(part, map(float, full), map(float, left), strict=True)]
-            for column, own, norm in zip(part, np.ascontiguousarray(rows.T), map(float, full), strict=True):
-                key = (id(metric), id(column.candidate), column.group)
-                entries = pending.setdefault(key, [])
-                entries.append((column, own, norm))
-                if len(entries) == column.count:
-                    del pending[key]
-                    _score_rows(entries, metric, leaders)
+                columns, left = itertools.chain.from_iterable(part), np.linalg.norm(rows, axis=0)
+                norms += map(Norms, columns, map(float, full), map(float, left))
+            for d in filter(None, scores(part, rows, metric.residual @ rows, full)):
+                old = leaders.get(id(d.candidate))
+                if old is None or d.log_p < old.log_p:
+                    leaders[id(d.candidate)] = d
     return [sorted(leaders.values(), key=lambda d: d.log_p) for leaders in best]
 
 
@@ -160,7 +171,7 @@ class Group:
         scale = 1 / EPSILON if any(p.amplitude for p in c.effect.parameters) else 1.0
         for shape, dim in self.sizes:
             own = {c.own(k): v for k, v in _values(c, shape, dim).items()}
-            yield Column(c, self.number, shape, dim, len(self.sizes), self.overlay, own, scale)
+            yield Column(c, self.number, shape, dim, self.overlay, own, scale)
 
 
 def _values(c: Candidate, shape: Mapping[str, float], dim: Sequence[float]) -> dict[str, float]:
@@ -200,10 +211,3 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
         return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]
-
-
-def _score_rows(entries: Sequence[Entry], metric: Metric, best: dict[int, Direction]) -> None:
-    """Score the columns of one group, and keep their best direction."""
-    rows = np.stack([e[1] for e in entries]).T
-    full = np.array([e[2] for e in entries])
-    score([e[0] for e in entries], rows, rows.T @ metric.residual, full, best)

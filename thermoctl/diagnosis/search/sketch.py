@@ -18,12 +18,13 @@ products, and no simulation each."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 from scipy.sparse import csc_matrix, identity
 from scipy.sparse.linalg import splu
 
-from thermoctl.diagnosis.search.gains import Column, Direction, score
+from thermoctl.diagnosis.search.gains import Column, Direction, scores
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
 from thermoctl.diagnosis.search.screen import Group
@@ -46,15 +47,14 @@ def likeliest(
     code = metrics[0].model.code
     if code.input_delays or code.output_delays or code.fmus:
         return groups
-    columns = [column for g in groups for column in g.columns()]
-    if len(columns) <= EXACT:
+    if sum(len(g.sizes) for g in groups) <= EXACT:
         return groups
-    edges = np.cumsum([len(g.sizes) for g in groups])[:-1]
+    columns = [list(g.columns()) for g in groups]
     keep: set[int] = set()
-    for product in products(metrics, trajectories, columns):
-        parts = np.split(product, edges)
-        scored = [_scored(list(g.columns()), x) for g, x in zip(groups, parts, strict=True)]
-        keep |= foremost_groups(groups, scored, KEPT)
+    for product in products(metrics, trajectories, list(chain.from_iterable(columns))):
+        rows = product[:, 1:].T
+        found = scores(columns, rows, product[:, 0], np.linalg.norm(rows, axis=0))
+        keep |= foremost_groups(groups, found, KEPT)
     return [groups[i] for i in sorted(keep)]
 
 
@@ -83,18 +83,11 @@ def _vectors(metric: Metric) -> np.ndarray:
     return metric.pulled(whole) * metric.weight[:, None]
 
 
-def _scored(columns: Sequence[Column], products: np.ndarray) -> Direction | None:
-    """Return the best direction of a group, or None, from its columns' `products` (k, 1 + SKETCHES)."""
-    rows, best = products[:, 1:].T, dict[int, Direction]()
-    score(columns, rows, products[:, 0], np.linalg.norm(rows, axis=0), best)
-    return next((d for d in best.values() if d.gain > 0), None)
-
-
 def foremost_groups(groups: Sequence[Group], directions: Sequence[Direction | None], most: int) -> set[int]:
     """Return the positions of the best group of each of the best candidates, up to `most` columns."""
     best: dict[int, tuple[float, int]] = {}
     for i, (g, d) in enumerate(zip(groups, directions, strict=True)):
-        if d is not None:
+        if d is not None and d.gain > 0:
             best[id(g.candidate)] = min(best.get(id(g.candidate), (np.inf, i)), (d.log_p, i))
     order = [i for _, i in sorted(best.values())]
     until = np.searchsorted(np.cumsum([len(groups[i].sizes) for i in order]), most, side="right")
