@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.special import logsumexp
 
 from thermoctl.diagnosis.data.coordinates import Coordinates, transform
-from thermoctl.diagnosis.data.grids import Grid, grid
+from thermoctl.diagnosis.data.grids import Grid, Reading, grid
 from thermoctl.diagnosis.data.spectra import SLOW, slow_parts
 from thermoctl.diagnosis.evidence import noise as module
 from thermoctl.diagnosis.evidence.densities import NOISE, REMAINDER
@@ -31,7 +31,8 @@ def banded(
     n = len(e)
     d = Excitation("run", np.arange(n) * 1.0, np.zeros((n, 0)), e[:, None], {}, np.zeros(0, np.intc))
     c = Coordinates([d])
-    return [grid(c, [0], sigma, SWING, change, block=block)], c.powers([transform(c.channels[0], e)])
+    reading = Reading("y", sigma, None, SWING, change, False, block)
+    return [grid(c, [0], reading)], c.powers([transform(c.channels[0], e)])
 
 
 def likelihood(e: np.ndarray) -> Averaged:

@@ -13,7 +13,7 @@ from scipy.special import bdtrc
 
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
-from thermoctl.diagnosis.data.grids import Grid, grid
+from thermoctl.diagnosis.data.grids import Grid, Reading, grid
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced, switches
@@ -118,8 +118,7 @@ class Case:
     @property
     def measured(self) -> list[str]:
         """Return the names of the outputs that `grids` are of."""
-        channels = (self.coordinates.channels[g.channels[0]] for g in self.grids)
-        return [self.null.model.outputs[c.output] for c in channels]
+        return [g.output for g in self.grids]
 
     def drives(self, model: Model) -> list[Excitation]:
         """Return the recordings as a model reads them.
@@ -246,11 +245,15 @@ def grids_of(
     out, change = [], _changes(null, drives, block)
     outputs = list(null.model.plant.outputs.values())
     for j, ks in coordinates.by_output().items():
-        stated, sensor = outputs[j].noise, None
-        if isinstance(stated, SensorNoise):
-            sensor = dataclasses.replace(stated, white=stated.white / np.sqrt(block))
-        swing = float(np.nanstd(np.concatenate([d.y[:, j] for d in drives])))
-        out.append(grid(coordinates, ks, null.noise[j].sigma, swing, change[j], sensor, block))
+        o, sensor, sigma = outputs[j], None, null.noise[j].sigma
+        if isinstance(o.noise, SensorNoise):
+            sensor = dataclasses.replace(o.noise, white=o.noise.white / np.sqrt(block))
+        columns = [d.y[:, j] for d in drives]
+        swing = float(np.nanstd(np.concatenate(columns)))
+        moves = np.concatenate([np.abs(np.diff(y[np.isfinite(y)])) for y in columns])
+        coarse = bool(sigma < (o.resolution or 0.0) >= np.median(moves))
+        reading = Reading(o.name, sigma, sensor, swing, change[j], coarse, block)
+        out.append(grid(coordinates, ks, reading))
     return tuple(out)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +29,22 @@ WALK = np.log(4.0)
 
 
 @dataclass(frozen=True)
-class Grid:
+class Reading:
+    """The numbers of an output that its grid depends on, beside its rows."""
+
+    output: str
+    sigma: float  # s of noise.py: standard deviation of the stated noise, in the output's unit
+    sensor: SensorNoise | None  # the parts of that noise, if stated
+    swing: float  # rms of the output about its mean
+    change: float  # w of noise.py: rms change in a sampling interval, over the root of `block`
+    coarse: bool  # it changes by less than a step in a sample: its error depends on the signal
+    # Number of samples whose mean is one row. Such a mean has the spectrum of the samples, divided by their
+    # number: slow parts keep their size and time.
+    block: int
+
+
+@dataclass(frozen=True)
+class Grid(Reading):
     """The frequency grid of one output, common to its recordings, and the prior of its remainder there.
 
     `node`: for each band of all recordings, the index of the band's frequency in the grid. `count`: number of
@@ -38,7 +53,6 @@ class Grid:
     channels: tuple[int, ...]  # positions in Coordinates.channels
     node: np.ndarray
     count: np.ndarray
-    block: int  # samples whose mean is one row of the recordings
     turn: np.ndarray  # (nodes,) angle of each frequency in a sampling interval, rad
     shape: np.ndarray  # the stated noise's spectrum, its mean over all rows 1
     slow: np.ndarray  # (starts, nodes) likewise, of a noise with slow parts, at each row of STARTS
@@ -46,10 +60,6 @@ class Grid:
     rough: np.ndarray  # (nodes, nodes) inverse covariance of u
     log_rough: float  # log determinant of `rough`
     log_small: float  # log of the half-normal's mean over the random walk
-    sigma: float  # s of noise.py: standard deviation of the stated noise, in the output's unit
-    change: float  # w of noise.py: the output's change in a sampling interval, in its unit
-    swing: float  # rms of the output about its mean
-    sensor: SensorNoise | None  # the parts of the stated noise
 
     def power(self, powers: Sequence[np.ndarray]) -> np.ndarray:
         """Return the power at each frequency (nodes,). `powers`: by band, of all channels of all outputs."""
@@ -87,23 +97,8 @@ class Grid:
         return (SMALL * self.swing) ** 2
 
 
-def grid(
-    coordinates: Coordinates,
-    positions: Sequence[int],
-    sigma: float,
-    swing: float,
-    change: float = 0.0,
-    sensor: SensorNoise | None = None,
-    block: int = 1,
-) -> Grid:
-    """Return the frequency grid of one output.
-
-    - `positions`: of its channels
-    - `sigma`: standard deviation of its stated noise; `sensor`: the parts of that noise, if stated
-    - `swing`: its rms about the mean
-    - `change`: its rms change in a sampling interval, over the root of `block`
-    - `block`: number of samples whose mean is one row. Such a mean has the spectrum of the samples, divided
-      by their number: slow parts keep their size and time"""
+def grid(coordinates: Coordinates, positions: Sequence[int], reading: Reading) -> Grid:
+    """Return the frequency grid of one output. `positions`: of its channels."""
     channels = [coordinates.channels[k] for k in positions]
     octave = np.concatenate([np.log2(c.frequency) for c in channels])
     cells = np.round((octave - octave.min()) / np.log2(WIDTH)).astype(int)
@@ -118,26 +113,21 @@ def grid(
         np.linalg.cholesky(rough).T, np.random.default_rng(3).standard_normal((len(used), DRAWS))
     )
     log_small = float(logsumexp(-0.5 * count @ np.exp(walks) / count.sum()) - np.log(DRAWS))
-    log_rough = float(np.linalg.slogdet(rough)[1])
     frequency = np.exp2(octave.min()) * WIDTH**used
-    interval = channels[0].interval
-    turn = 2 * np.pi * frequency * interval / block
+    interval, sensor = channels[0].interval, reading.sensor
+    turn = 2 * np.pi * frequency * interval / reading.block
     shape = spectrum(sensor or SensorNoise(1.0), frequency, interval)
     slow = np.array([slow_parts(turn, x) for x in STARTS])
     return Grid(
-        tuple(positions),
-        node,
-        count,
-        block,
-        turn,
-        shape * count.sum() / (shape @ count),
-        slow * count.sum() / (slow @ count)[:, None],
-        2 * sensor.sd if sensor and sensor.sd else STATED,
-        rough,
-        log_rough,
-        log_small,
-        sigma,
-        change,
-        swing,
-        sensor,
+        **{f.name: getattr(reading, f.name) for f in fields(Reading)},
+        channels=tuple(positions),
+        node=node,
+        count=count,
+        turn=turn,
+        shape=shape * count.sum() / (shape @ count),
+        slow=slow * count.sum() / (slow @ count)[:, None],
+        known=2 * sensor.sd if sensor and sensor.sd else STATED,
+        rough=rough,
+        log_rough=float(np.linalg.slogdet(rough)[1]),
+        log_small=log_small,
     )

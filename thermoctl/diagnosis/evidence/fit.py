@@ -316,7 +316,6 @@ def remembered(case: Case, f: Fitted) -> Past:
     """Return the posterior of a hypothesis from all recordings so far."""
     shared = np.array([r is None for _, r in f.fit.unknowns], bool)
     names = tuple(q for q, r in f.fit.unknowns if r is None)
-    outputs = [*zip(case.measured, case.grids, strict=True)]
     return Past(
         placed_before(f.hypothesis.effects, f.plant),
         names,
@@ -325,10 +324,10 @@ def remembered(case: Case, f: Fitted) -> Past:
         f.curvature,
         f.log_evidence,
         {
-            o: f.past.squares.get(o, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels)
-            for o, g in outputs
+            g.output: f.past.squares.get(g.output, 0.0) + sum(float(f.powers[k].sum()) for k in g.channels)
+            for g in case.grids
         },
-        {o: f.past.counts.get(o, 0.0) + float(g.count.sum()) for o, g in outputs},
+        {g.output: f.past.counts.get(g.output, 0.0) + float(g.count.sum()) for g in case.grids},
     )
 
 

@@ -38,26 +38,19 @@ def timing(case: Case, f: Fitted) -> list[float]:
 def late(case: Case, f: Fitted) -> list[str]:
     """Return a sentence for each output whose uncertain times add more error than the stated noise."""
     out = []
-    for name, g, v in zip(case.measured, case.grids, timing(case, f), strict=True):
+    for g, v in zip(case.grids, timing(case, f), strict=True):
         if v > g.variance:
-            unit = case.plant.outputs[name].unit or ""
+            unit = case.plant.outputs[g.output].unit or ""
             out.append(
-                f"{name} errs by {np.sqrt(v):.2g} {unit} beside its noise, at all frequencies: recorded times that are off by "
+                f"{g.output} errs by {np.sqrt(v):.2g} {unit} beside its noise, at all frequencies: recorded times that are off by "
                 f"{100 * np.sqrt(v) / g.change:.2g} % of a sampling interval would do that"
             )
     return out
 
 
 def rounded(case: Case) -> list[bool]:
-    """Return for each output whether it is coarsely rounded: it changes by less than a step in a sample.
-
-    The error of such a reading depends on the signal, so a remainder there proves nothing."""
-    drives, out = case.drives(case.null.model), []
-    for name, g in zip(case.measured, case.grids, strict=True):
-        step, j = case.plant.outputs[name].resolution or 0.0, case.null.model.outputs.index(name)
-        moves = [np.abs(np.diff(d.y[np.isfinite(d.y[:, j]), j])) for d in drives]
-        out.append(bool(step > g.sigma and np.median(np.concatenate(moves)) <= step))
-    return out
+    """Return for each output whether it is coarsely rounded: a remainder there proves nothing."""
+    return [g.coarse for g in case.grids]
 
 
 def remainder(case: Case, f: Fitted) -> float:

@@ -349,8 +349,8 @@ def _behind(case: Case, problem: Problem, plant: Plant) -> Iterator[tuple[int, n
     place = {u: k for k, u in enumerate(problem.unknowns)}
     values = {q: p.value for q, p in plant.parameters.items()}
     interval = float(np.median(np.diff(problem.excitations[0].t)))
-    for name, g in zip(case.measured, case.grids, strict=True):
-        read = ex.names(plant.outputs[name].value) & plant.nodes.keys()
+    for g in case.grids:
+        read = ex.names(plant.outputs[g.output].value) & plant.nodes.keys()
         sensor = min(read - case.plant.nodes.keys(), default="")
         rates = [ex.undelayed(f.rate) for f in plant.flows.values() if f.target == sensor]
         if len(read) != 1 or len(rates) != 1:

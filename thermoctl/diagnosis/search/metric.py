@@ -75,10 +75,7 @@ class Plain:
             self.model.prepare(d, values)
         self.coordinates = Coordinates(self.drives, max(ROWS // len(case.coordinates.channels), 32))
         measured = self.coordinates.by_output().values()
-        self.grids = [
-            grid(self.coordinates, ks, g.sigma, g.swing, g.change, g.sensor, g.block)
-            for ks, g in zip(measured, case.grids, strict=True)
-        ]
+        self.grids = [grid(self.coordinates, ks, g) for ks, g in zip(measured, case.grids, strict=True)]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
         self.point = self.fit.values, self.fit.dx0
         parts = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)

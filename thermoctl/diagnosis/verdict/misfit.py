@@ -174,11 +174,9 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
     parts = []
-    for output, g, (own, coarse), p in zip(
-        case.measured, case.grids, noise, f.average.remainder, strict=True
-    ):
-        power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(output, 0.0)
-        rows = float(g.count.sum()) + f.past.counts.get(output, 0.0)
+    for g, (own, coarse), p in zip(case.grids, noise, f.average.remainder, strict=True):
+        power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(g.output, 0.0)
+        rows = float(g.count.sum()) + f.past.counts.get(g.output, 0.0)
         square = power / (rows * own)
         noisy = 1.0 if p >= limits.name and not coarse else limits.clean**2
         parts.append((square, max(square - noisy, 0.0), rows))

@@ -87,7 +87,7 @@ def flow_gains(case: Case, f: Fitted, nodes: Sequence[str]) -> dict[str, float]:
     knots = int(np.clip(TOGETHER // len(metric.runs), FEWEST, KNOTS))
     knots = min(knots, *(len(d.t) for d in metric.drives))
     hats = [hat_functions(d.t, knots) for d in metric.drives]
-    coarse = {name for name, is_coarse in zip(case.measured, rounded(case), strict=True) if is_coarse}
+    coarse = {g.output for g, is_coarse in zip(case.grids, rounded(case), strict=True) if is_coarse}
     fine = [o not in coarse for o in case.null.model.outputs]
     counts = np.concatenate([np.full(c.rows, fine[c.output]) for c in metric.plain.coordinates.channels])
     _, weight = metric.weighed(metric.residual)
