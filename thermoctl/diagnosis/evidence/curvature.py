@@ -12,10 +12,8 @@ import numpy as np
 from thermoctl.diagnosis.evidence.onsets import TIMES, UNSEEN
 from thermoctl.diagnosis.evidence.posterior import Posterior, Seen
 from thermoctl.plant.fitting.climb import Spot
-from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import SimulationError
 
-EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is at its bound
 MOST = 0.9  # largest share of the curvature that the unknown spectrum may remove
 # Steps of an unknown in 0..1 without slopes: the first one, the factor to the next, and the fall, nats, that
 # ends them.
@@ -51,15 +49,6 @@ def deviations(
         if name in out:
             out[name] = float(np.hypot(out[name], sample / 12**0.5))
     return out
-
-
-def at_bound(problem: Problem, z: np.ndarray) -> dict[str, str]:
-    """Return "low" or "high" for each parameter at an end of its range."""
-    return {
-        q: "low" if z[k] <= EDGE else "high"
-        for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters])
-        if not EDGE < z[k] < 1 - EDGE
-    }
 
 
 def relieved(matrix: np.ndarray, relief: np.ndarray) -> np.ndarray:

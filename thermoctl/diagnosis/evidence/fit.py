@@ -21,7 +21,7 @@ from scipy.special import chdtrc, chdtri
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.memory import Past, PlacedBefore
-from thermoctl.diagnosis.evidence.curvature import at_bound, deviations, kept, relieved, without_slopes
+from thermoctl.diagnosis.evidence.curvature import deviations, kept, relieved, without_slopes
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.evidence.onsets import moved
 from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
@@ -268,7 +268,7 @@ def _weighed(
     confined = matrix + np.diag(np.where(own, UNIFORM, 0.0))  # a range has a width
     confined = relieved(confined, posterior.relief(z, spot.found.rows, average))
     confined += np.diag(flat)
-    bounds = at_bound(problem, z)
+    bounds = problem.at_bound(z)
     sd = deviations(posterior, values, confined, bounds)
     volume = 0.5 * len(z) * LOG_2PI - 0.5 * float(np.linalg.slogdet(confined)[1])
     maximum = Fit(

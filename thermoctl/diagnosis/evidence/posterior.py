@@ -21,13 +21,13 @@ from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, Keys
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.climb import Climbed, Spot, climb
+from thermoctl.plant.fitting.residuals import FAR as FAR  # law/smooth.py, too, has it from here
 from thermoctl.plant.fitting.residuals import HUGE, PROBE, Problem
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 
 BELIEF = 0.3  # prior sd of a plant parameter about its value in the file, as a share of its range
 ROUNDS = 40  # largest number of steps
-FAR = 8.0  # bound of an initial state, in standard deviations of its prior
 ENOUGH = 0.05  # nats: the climb ends when a step promises a smaller rise of the log posterior
 
 
@@ -161,8 +161,7 @@ class Posterior:
             self.model.prepare(d)
         self.problem = Problem(self.model, self.drives, case.noise)
         self.few = self.problem.few
-        starts = np.arange(len(self.problem.unknowns)) >= self.problem.n_parameters
-        self.bounds = np.where(starts, -FAR, 0.0), np.where(starts, FAR, 1.0)
+        self.bounds = self.problem.bounds
         self.sizes, self.mean, precision = _priors(case, self.problem, effects)
         self.past = case.memory.of(frozenset(e.key for e in effects), plant)
         place = {q: k for k, (q, r) in enumerate(self.problem.unknowns) if r is None}

@@ -18,8 +18,6 @@ from thermoctl.plant.fitting.residuals import Evaluation, Prior, Problem, Residu
 from thermoctl.plant.fitting.whitening import Noise, default_noise
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
 
-AT_BOUND = 1e-6  # a parameter counts as at its bound within this share of its range
-MAX_SHIFT = 8.0  # largest shift of an uncertain initial state, in its standard deviations
 KEPT_STARTS = 2  # number of random starts that are refined
 PREVIEW = 12  # iterations of a further start before its cost is compared with PREVIEW_SHARE of the best
 PREVIEW_SHARE = 0.98
@@ -231,9 +229,7 @@ class _Misfit:
 
     def __init__(self, problem: Problem, z: np.ndarray, held: Sequence[int]):
         self.problem, self.few = problem, problem.few
-        n, states = problem.n_parameters, len(problem.unknowns) - problem.n_parameters
-        shift = np.full(states, MAX_SHIFT)
-        self.bounds = np.append(np.zeros(n), -shift), np.append(np.ones(n), shift)
+        self.bounds = problem.bounds
         for bound in self.bounds:
             bound[list(held)] = z[list(held)]
         self.rows: list[ResidualRows] = []  # where the climb stands
@@ -274,12 +270,6 @@ def _descend(problem: Problem, z: np.ndarray, limits: _Limits, held: Sequence[in
 def _result(problem: Problem, top: Climbed[Found]) -> Fit:
     z, now = top.spot.z, top.spot.found[0]
     values, dx0 = problem.unpack(z)
-    at_bound = {}
-    for k, (q, _) in enumerate(problem.unknowns[: problem.n_parameters]):
-        if z[k] <= AT_BOUND:
-            at_bound[q] = "low"
-        elif z[k] >= 1 - AT_BOUND:
-            at_bound[q] = "high"
     return Fit(
         problem.model,
         values,
@@ -292,7 +282,7 @@ def _result(problem: Problem, top: Climbed[Found]) -> Fit:
         problem.noise,
         top.steps,
         problem.samples,
-        at_bound,
+        problem.at_bound(z),
         problem.priors,
         converged=top.converged,
         left=2 * top.left,

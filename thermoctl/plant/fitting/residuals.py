@@ -30,6 +30,8 @@ from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationErr
 HUGE = 1e100  # outputs from here on count as infinite: the sums of their squares would be
 HUBER = 4.0  # residuals beyond this many standard deviations count linearly
 PRIOR_WEIGHT = 0.02  # moving a parameter over its whole range costs as much as one residual of 0.02 sigma
+EDGE = 1e-6  # share of a parameter's range: closer to an end, the parameter is at its bound
+FAR = 8.0  # bound of an uncertain initial state, in its standard deviations
 PROBE = 0.1  # share of a step over which the curvature of the residuals is measured
 DOWNDATE_SHARE = 0.25  # up to this share of down-weighted rows, their excess is subtracted from J'J
 # Unknowns up to which a run with sensitivities costs less than ten without: eight go through the processor at
@@ -179,6 +181,20 @@ class Problem:
             else:
                 out.append(0.0)
         return np.array(out)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest values of the unknowns (scaled)."""
+        starts = np.arange(len(self.unknowns)) >= self.n_parameters
+        return np.where(starts, -FAR, 0.0), np.where(starts, FAR, 1.0)
+
+    def at_bound(self, z: np.ndarray) -> dict[str, str]:
+        """Return "low" or "high" for each parameter at an end of its range."""
+        return {
+            q: "low" if z[k] <= EDGE else "high"
+            for k, (q, _) in enumerate(self.unknowns[: self.n_parameters])
+            if not EDGE < z[k] < 1 - EDGE
+        }
 
     def with_noise(self, j: int, n: Noise) -> Problem:
         """Return the same problem with another noise of output j."""
