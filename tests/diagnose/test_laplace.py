@@ -11,7 +11,8 @@ from scipy.stats import multivariate_t, norm
 
 from tests.plants import HEATER
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.evidence.fit import Placed, Posterior, fitted, log_density
+from thermoctl.diagnosis.evidence.fit import Placed, fitted, log_density
+from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig

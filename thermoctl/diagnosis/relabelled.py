@@ -88,7 +88,7 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     if stays and _misfit(again, leader.fitted, limits) >= HALF * stays:
         return None
     effects = ", ".join(spoken(leader.fitted.hypothesis.keys))
-    present_effects = ", ".join(f"{e.key[0]} at {e.key[1]}" for e in found.best.hypothesis.effects)
+    present_effects = ", ".join(spoken(found.best.hypothesis.keys))
     a, b = h.columns
     return Finding(
         "swapped",

@@ -494,7 +494,7 @@ def _lost(d: Diagnosis) -> list[dict[str, Any]]:
             out[key] = {
                 "effect": key[0],
                 "where": key[1],
-                "beside": sorted(f"{e} at {at}" for e, at in keys - {key}),
+                "beside": spoken(keys - {key}),
                 "probability": d.posterior.effects.get(key, 0.0),
                 "below_best": _final_score(d) - w.score,
                 "reason": _why_not(d, w, {key}),

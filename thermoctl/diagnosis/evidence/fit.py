@@ -24,9 +24,8 @@ from thermoctl.diagnosis.data.memory import Past, PlacedBefore
 from thermoctl.diagnosis.evidence.curvature import deviations, kept, relieved, without_slopes
 from thermoctl.diagnosis.evidence.noise import Averaged, averaged
 from thermoctl.diagnosis.evidence.onsets import moved
-from thermoctl.diagnosis.evidence.posterior import Hypothesis, Seen, gaussian
+from thermoctl.diagnosis.evidence.posterior import Hypothesis, Posterior, Seen, gaussian
 from thermoctl.diagnosis.evidence.posterior import Placed as Placed
-from thermoctl.diagnosis.evidence.posterior import Posterior as Posterior
 from thermoctl.diagnosis.evidence.starts import beside_parent, first_point
 from thermoctl.diagnosis.hypothesis.candidates import Keys
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter

@@ -221,13 +221,13 @@ def swap(s: Search) -> None:
         effects = best.fitted.hypothesis.effects
         # the rest of a single effect is the plant alone, which is extended first of all
         for e in effects if len(effects) > 1 or frozenset() not in s.seen else ():
-            rest = tuple(o for o in effects if o is not e)
-            if frozenset(o.key for o in rest) in s.seen:
+            rest, keys = tuple(o for o in effects if o is not e), best.fitted.hypothesis.keys - {e.key}
+            if keys in s.seen:
                 continue
             if s.case.budget.stopped():
                 s.case.budget.untried += 1
                 continue
-            parent = s.tried.get(frozenset(o.key for o in rest)) or rebuilt(s, rest, best.fitted, best.fitted)
+            parent = s.tried.get(keys) or rebuilt(s, rest, best.fitted, best.fitted)
             if parent is None:
                 continue
             if not parent.fitted.doubtful:
@@ -269,7 +269,7 @@ def cleared(s: Search) -> list[Weighed]:
     values = dataclasses.replace(best.fitted, rough_plant=best.fitted.plant)
     for e in best.fitted.hypothesis.effects:
         rest = tuple(o for o in best.fitted.hypothesis.effects if o is not e)
-        known = s.tried.get(frozenset(o.key for o in rest))
+        known = s.tried.get(best.fitted.hypothesis.keys - {e.key})
         if not known or known.score > best.score - SURPLUS or s.case.budget.stopped():
             continue
         if near_nothing(best.fitted, e) and (w := rebuilt(s, rest, values, best.fitted, near=best.fitted)):

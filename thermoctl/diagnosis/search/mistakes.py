@@ -14,7 +14,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted, Placed, Posterior, fitted
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
+from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.files.shipped import shipped

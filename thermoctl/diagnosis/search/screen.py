@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.onsets import ONSETS
+from thermoctl.diagnosis.evidence.onsets import ONSETS, TIMES
 from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.search.gains import Column, Direction, parameter_values, scores
@@ -140,7 +140,7 @@ def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
         near = np.concatenate(
             [
                 direction.shape[k] + step * np.arange(-4, 5) / 4
-                for k in ("onset", "start", "end")
+                for k in TIMES
                 if direction.shape.get(k, np.inf) <= rig.duration
             ]
         )

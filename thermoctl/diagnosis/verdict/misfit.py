@@ -26,7 +26,7 @@ import numpy as np
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import DECADES, Fitted, as_refitted, significance
 from thermoctl.diagnosis.evidence.levels import rounded
-from thermoctl.diagnosis.hypothesis.candidates import Key
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import Searched
 
@@ -49,11 +49,8 @@ class Energy:
 
 
 def standing(
-    energy: Mapping[frozenset[Key], Energy],
-    dims: Mapping[Key, int],
-    contains: Mapping[str, str],
-    limits: Thresholds,
-) -> dict[frozenset[Key], dict[Key, float]]:
+    energy: Mapping[Keys, Energy], dims: Mapping[Key, int], contains: Mapping[str, str], limits: Thresholds
+) -> dict[Keys, dict[Key, float]]:
     """Return the probability that each effect of a hypothesis is physics, by hypothesis.
 
     Hypotheses with effects are left out if no effect of theirs stands out of the misfit. An effect is
@@ -62,7 +59,7 @@ def standing(
     without them. A hypothesis is left out, too, if an effect in it does not stand out against the simpler
     entry that it contains. `dims`: number of parameters of each effect; `contains`: by entry, the simpler
     one."""
-    probabilities: dict[frozenset[Key], dict[Key, float]] = {}
+    probabilities: dict[Keys, dict[Key, float]] = {}
     simpler = set()
     for home in sorted(energy, key=len):
         mine, own = energy[home], {}
@@ -79,9 +76,9 @@ def standing(
 
 
 def _is_simpler(
-    home: frozenset[Key],
+    home: Keys,
     key: Key,
-    energy: Mapping[frozenset[Key], Energy],
+    energy: Mapping[Keys, Energy],
     dims: Mapping[Key, int],
     contains: Mapping[str, str],
     limits: Thresholds,
@@ -101,19 +98,17 @@ def _share(dims: int, limits: Thresholds) -> float:
     return 1 - (1 - limits.alike) ** dims
 
 
-def _without(energy: Mapping[frozenset[Key], Energy], home: frozenset[Key], key: Key) -> Energy:
+def _without(energy: Mapping[Keys, Energy], home: Keys, key: Key) -> Energy:
     """Return the energy of the best tried hypothesis without an effect, whose effects are a subset."""
     return min((e for keys, e in energy.items() if keys < home and key not in keys), key=lambda e: e.all)
 
 
-def standouts(of: Mapping[Key, float]) -> frozenset[Key]:
+def standouts(of: Mapping[Key, float]) -> Keys:
     """Return the effects that are more probably physics than a misfit."""
     return frozenset(key for key, p in of.items() if p > MISFIT)
 
 
-def supported(
-    likeliest: frozenset[Key], probabilities: Mapping[frozenset[Key], Mapping[Key, float]]
-) -> frozenset[Key]:
+def supported(likeliest: Keys, probabilities: Mapping[Keys, Mapping[Key, float]]) -> Keys:
     """Return the effects of a hypothesis without those that are more probably a misfit.
 
     The weakest is left out first. Of two effects of the same shape, neither stands out beside the other. The
@@ -144,7 +139,7 @@ def _square(without: Energy, beside: Energy, share: float) -> float:
     return float((removed / variance).sum())
 
 
-def deviations(f: Fitted, energy: Mapping[frozenset[Key], Energy], limits: Thresholds) -> Mapping[str, float]:
+def deviations(f: Fitted, energy: Mapping[Keys, Energy], limits: Thresholds) -> Mapping[str, float]:
     """Return the standard deviations of the effects' parameters, noise and misfit together."""
     home, sd = f.hypothesis.keys, dict(f.sd)
     for e in f.hypothesis.effects:
@@ -154,7 +149,7 @@ def deviations(f: Fitted, energy: Mapping[frozenset[Key], Energy], limits: Thres
     return sd
 
 
-def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[frozenset[Key], Energy]:
+def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[Keys, Energy]:
     """Return the energies of all hypotheses.
 
     Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there. The
