@@ -45,13 +45,6 @@ class Linear:
 
 def linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
     """Linearise a fitted plant about its trajectories; None where a delay or an FMU has no derivative."""
-    try:
-        return _linear(fit, drives)
-    except ex.ExpressionError:
-        return None
-
-
-def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
     model, n = fit.model, len(drives)
     states, outputs = model.states, model.plant.outputs.values()
     a, c, rate = np.zeros((len(states),) * 2), np.zeros((len(outputs), len(states))), np.zeros(len(states))
@@ -62,12 +55,15 @@ def _linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
             """Return the median of an expression over time."""
             return float(np.median(np.asarray(ex.evaluate(e, values), float)))
 
-        for i, slope in enumerate(model.code.slopes):
-            if not ex.names(slope) <= values.keys():
-                return None
-            rate[i] += float(np.sqrt(np.mean(np.asarray(ex.evaluate(slope, values), float) ** 2))) / n
-            a[i] += [median(ex.derivative(slope, s)) / n for s in states]
-        c += [[median(ex.derivative(o.value, s)) / n for s in states] for o in outputs]
+        try:
+            for i, slope in enumerate(model.code.slopes):
+                if not ex.names(slope) <= values.keys():
+                    return None
+                rate[i] += float(np.sqrt(np.mean(np.asarray(ex.evaluate(slope, values), float) ** 2))) / n
+                a[i] += [median(ex.derivative(slope, s)) / n for s in states]
+            c += [[median(ex.derivative(o.value, s)) / n for s in states] for o in outputs]
+        except ex.ExpressionError:
+            return None
     return Linear(a, c, rate)
 
 
