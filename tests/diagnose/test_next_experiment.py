@@ -201,10 +201,8 @@ def test_what_nothing_else_confirms_is_told_from_the_plant_as_it_is(undecided):
 def test_what_is_written_is_read_by_the_experiment_command(undecided, tmp_path):
     found = undecided
     entry, chosen = propose(found, limits=LIMITS)
-    assert set(experiment_file.write(tmp_path, found.case, entry, chosen)) == {
-        "next_experiment.yaml",
-        "next_experiment.csv",
-    }
+    experiment_file.write(tmp_path, found.case, entry, chosen)
+    assert {p.name for p in tmp_path.iterdir()} == {"next_experiment.yaml", "next_experiment.csv"}
     (read,) = load_inputs(tmp_path / "next_experiment.yaml").values()
     assert read.corners["heat"] == pytest.approx(chosen.corners["heat"]) and read.assumed == {"air": 22.0}
     by_hand = read_table(tmp_path / "next_experiment.csv")

@@ -20,6 +20,7 @@ from thermoctl.recording.table import Table
 from thermoctl.units import dimension, readable_time
 
 TOGETHER = 0.98  # correlation from which two inputs count as one lever, such as voltage and current
+FEWEST = 10  # two inputs with so few common samples are not taken as one
 # Dimensions of temperature, sunshine and pressure: these cannot be commanded.
 SURROUNDINGS = ("K", "W/m^2", "Pa")
 LENGTHS = (1.0, 0.5, 2.0)  # durations of experiments, over the median duration of the recordings
@@ -89,16 +90,13 @@ def levers(
         if (i.name not in only if only else surroundings or i.role == "time_of_day") or not _moved(parts):
             continue
         values = np.concatenate(parts)
-        partner = next((k for k, other in enumerate(series) if _together(values, other)), None)
-        if partner is None:
+        for k, other in enumerate(series):
+            if line := together(other, values):
+                out[k] = dataclasses.replace(out[k], moves={**out[k].moves, i.name: line})
+                break
+        else:
             out.append(_lever(i.name, i.column, tables, limits))
             series.append(values)
-        else:
-            other, lever = series[partner], out[partner]
-            both = np.isfinite(values) & np.isfinite(other)
-            factor, offset = np.polyfit(other[both], values[both], 1)
-            moves = {**lever.moves, i.name: (float(factor), float(offset))}
-            out[partner] = dataclasses.replace(lever, moves=moves)
     return out
 
 
@@ -107,9 +105,15 @@ def _moved(parts: Sequence[np.ndarray]) -> bool:
     return any(np.nanstd(p) > 1e-6 * max(largest, 1e-300) for p in parts if np.isfinite(p).any())
 
 
-def _together(a: np.ndarray, b: np.ndarray) -> bool:
-    both = np.isfinite(a) & np.isfinite(b) if len(a) == len(b) else None
-    return both is not None and bool(abs(np.corrcoef(a[both], b[both])[0, 1]) > TOGETHER)
+def together(a: np.ndarray, b: np.ndarray) -> tuple[float, float] | None:
+    """Return the factor and the offset by which b follows a; None where they do not move together."""
+    if len(a) != len(b):
+        return None
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() <= FEWEST or not abs(np.corrcoef(a[both], b[both])[0, 1]) > TOGETHER:
+        return None
+    factor, offset = np.polyfit(a[both], b[both], 1)
+    return float(factor), float(offset)
 
 
 def _lever(name: str, column: str, tables: Sequence[Table], limits: Ranges) -> Lever:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.experiment.design import TOGETHER, Excitation
+from thermoctl.diagnosis.experiment.design import Excitation, together
 from thermoctl.files.safe_file import write_text
 from thermoctl.recording.files import write_table
 from thermoctl.recording.table import Table
@@ -19,11 +19,10 @@ FORMAT = "thermoctl-experiments/1"
 FILES = ("next_experiment.yaml", "next_experiment.csv")
 SETPOINT = "setpoint_um"  # the daemon commands it; the current of a flexure's actuator follows it
 ROWS = 20_000  # largest number of rows in the table for a person
-FEWEST = 10  # least number of samples to fit a straight line of an input over the setpoint
 
 
-def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation) -> list[str]:
-    """Write FILES into a folder; return their names.
+def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation) -> None:
+    """Write FILES into a folder.
 
     On a rig that this program controls, the experiment commands the setpoint."""
     plant = case.plant
@@ -61,7 +60,6 @@ def write(folder: Path, case: Case, entry: Mapping[str, Any], chosen: Excitation
     t = np.arange(0.0, chosen.duration_s + 1e-9, max(entry["sample_s"], chosen.duration_s / ROWS))
     columns = {n: np.interp(t, c[:, 0], c[:, 1]) for n, (_, c) in driven.items()}
     write_table(folder / FILES[1], Table("next_experiment", FILES[1], t, columns))
-    return list(FILES)
 
 
 def _as_setpoint(case: Case, chosen: Excitation) -> np.ndarray | None:
@@ -71,10 +69,8 @@ def _as_setpoint(case: Case, chosen: Excitation) -> np.ndarray | None:
     setpoint = np.concatenate([t.columns[SETPOINT] for t in case.tables])
     for n, c in chosen.corners.items():
         values = np.concatenate([t.columns[case.plant.inputs[n].column] for t in case.tables])
-        both = np.isfinite(values) & np.isfinite(setpoint)
-        if both.sum() > FEWEST and abs(np.corrcoef(values[both], setpoint[both])[0, 1]) > TOGETHER:
-            factor, offset = np.polyfit(values[both], setpoint[both], 1)
-            inside = np.clip(c[:, 1] * factor + offset, np.nanmin(setpoint), np.nanmax(setpoint))
+        if line := together(values, setpoint):
+            inside = np.clip(c[:, 1] * line[0] + line[1], np.nanmin(setpoint), np.nanmax(setpoint))
             return np.column_stack([c[:, 0], inside])
     return None
 
