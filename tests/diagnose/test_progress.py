@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,9 @@ from tests.diagnose.test_workers import rig
 from thermoctl.diagnosis.commands import on_interrupt
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.data.progress import Pace
+from thermoctl.diagnosis.diagnose import sought
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import beam as search
 from thermoctl.files import shipped
@@ -125,3 +129,13 @@ def test_a_background_job_that_ignores_interrupts_goes_on(foreground):
     with on_interrupt() as stopped:
         signal.raise_signal(signal.SIGINT)
         assert not stopped()
+
+
+def test_a_result_is_truncated_only_where_a_refit_was_left_out(tmp_path):
+    """The last refit allowed that ended a search told of hidden effects; the refits of laws hid one that was left out."""
+    plant, tables = rig(tmp_path, recordings=1)
+    entries, single = {"radiation": catalogue()["radiation"]}, replace(limits(), effects=1)
+    needed = sought(plant, tables, entries, single, ()).case.budget.fits_done
+    for fits in (needed, needed - 1):
+        found = sought(plant, tables, entries, replace(single, fits=fits), ())
+        assert found.searched.truncated == (fits < needed)

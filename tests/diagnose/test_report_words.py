@@ -19,7 +19,6 @@ from thermoctl.diagnosis.report.figures import (
     merged,
     number,
     outputs,
-    refits,
     remainder_rows,
     short,
     with_interval,
@@ -220,7 +219,7 @@ def test_values_without_an_interval_have_none():
 
 @given(st.integers(0, 300), st.integers(1, 200))
 def test_refits_are_never_more_than_their_limit(done, most):
-    for text in (refits(done, most), *progress(done, most)):
+    for text in progress(done, most):
         for a, b in re.findall(r"(\d+) of (?:at most )?(\d+)", text):
             assert int(a) <= int(b), text
         assert str(done) in text

@@ -113,13 +113,6 @@ def chance(p: float) -> str:
     return "above 0.99" if p >= 0.995 else "below 0.01" if p < 0.005 else f"{p:.2f}"
 
 
-def refits(done: int, most: int) -> str:
-    """Return the number of refits, with the limit of one search."""
-    if done <= most:
-        return f"{done} of at most {most} refits"
-    return f"{done} refits: a search has {most} at most, and others followed it"
-
-
 def number(value: float | None) -> str:
     """Return a number in three digits."""
     return NONE if value is None or not math.isfinite(value) else f"{value:.3g}"

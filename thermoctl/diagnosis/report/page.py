@@ -275,13 +275,13 @@ def _experiment(entry: Mapping[str, Any] | None) -> str:
 
 
 def _made(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
-    case, budget = diagnosis.case, diagnosis.case.budget
+    case = diagnosis.case
     files = ", ".join(Path(t.path).name for t in case.tables)
     ended = " The budget ended the search." if result["truncated"] else ""
     return _items(
         [
             f"{sum(len(t.t) for t in case.tables)} samples of {files}.",
-            f"{figures.refits(budget.fits_done, budget.fits)}; {len(result['hypotheses'])} hypotheses, in "
+            f"{case.budget.fits_done} refits; {len(result['hypotheses'])} hypotheses, in "
             f"{result['seconds']:.0f} s.{ended}",
             "Each hypothesis: simulation on the recorded inputs, refitted with exact sensitivities; log evidence by Laplace's "
             "method, averaged over the noise and over a remainder.",

@@ -168,7 +168,7 @@ def searched(s: Search) -> Searched:
     order = tuple(sorted(tried.values(), key=lambda w: -w.score))
     refused = {keys: why for keys, why in s.refused.items() if keys not in tried}
     return Searched(
-        order, s.case.budget.spent, s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
+        order, bool(s.case.budget.untried), s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
     )
 
 
@@ -390,7 +390,11 @@ def recall(s: Search) -> None:
     likeliest = max((h.log_evidence for h in past), default=0.0)
     for h in past:
         far = h.log_evidence < likeliest - BEATEN * s.limits.effects
-        if h.effects and not far and not s.case.budget.spent:
+        if not h.effects or far:
+            continue
+        if s.case.budget.spent:
+            s.case.budget.untried += 1
+        else:
             leader = max((w.fitted for w in s.tried.values()), key=lambda f: f.log_likelihood)
             found = remade(s, h.effects, s.case.plant, s.case.catalogue, leader)
             if found:

@@ -53,6 +53,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
             return None
 
     tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
+    case.budget.untried += len(best[:most]) - len(tried)
     return [f for f in each(refitted, tried) if f is not None and not f.absent]
 
 
