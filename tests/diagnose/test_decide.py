@@ -22,11 +22,11 @@ def weighed(scores):
 def test_a_small_remainder_that_is_certain_is_not_nothing():
     found = weighed({NOTHING: 0.0, ONE: -9.0})
     assert (
-        decide(found, Facts(found.something, found.something, (), 1.04, 1.0, remains=0.99), limits()).verdict
+        decide(found, Facts(found.something, found.something, (), 1.04, remains=0.99), limits()).verdict
         == "unexplained"
     )
     found = weighed({NOTHING: 0.0, ONE: 40.0})
-    beside = decide(found, Facts(found.something, found.something, (A,), 1.04, 0.3, remains=0.99), limits())
+    beside = decide(found, Facts(found.something, found.something, (A,), 1.04, remains=0.99), limits())
     assert (beside.verdict, beside.named) == ("partly_explained", (A,))
 
 
@@ -44,7 +44,7 @@ def test_a_small_remainder_that_is_certain_is_not_nothing():
 def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
     posterior = weighed(scores)
     found = decide(
-        posterior, Facts(posterior.something, posterior.something, named, over_noise, 1.0, worse), limits()
+        posterior, Facts(posterior.something, posterior.something, named, over_noise, worse), limits()
     )
     assert found.verdict == verdict
     assert (found.named == named) == (verdict in ("explained", "partly_explained") or not named)
@@ -53,19 +53,19 @@ def test_each_row_gives_its_verdict(scores, named, over_noise, worse, verdict):
 def test_what_does_not_follow_a_recording_set_aside_explains_a_part_only():
     """The findings bring the error there down to 1.8 times the noise: the fit knew the other recordings' rooms."""
     found = weighed({NOTHING: 0.0, ONE: 40.0})
-    facts = [Facts(found.something, found.something, (A,), 1.0, 0.9, apart=x) for x in (0.0, 1.2, 1.8)]
+    facts = [Facts(found.something, found.something, (A,), 1.0, apart=x) for x in (0.0, 1.2, 1.8)]
     verdicts = [decide(found, f, limits()).verdict for f in facts]
     assert verdicts == ["explained", "explained", "partly_explained"]
 
 
 def test_what_nothing_else_confirms_is_missing_and_has_no_name():
     found = weighed({NOTHING: 0.0, ONE: 40.0})
-    assert decide(found, Facts(found.something, 0.0, (), 3.0, 1.0), limits()).verdict == "unexplained"
+    assert decide(found, Facts(found.something, 0.0, (), 3.0), limits()).verdict == "unexplained"
 
 
 def test_alternatives_hold_the_set_and_no_more():
     found = weighed({NOTHING: 0.0, ONE: 40.0, OTHER: 39.5, frozenset({("back_emf", "v")}): 10.0})
-    facts = Facts(found.something, found.something, (), 1.0, 0.3)
+    facts = Facts(found.something, found.something, (), 1.0)
     assert [k for k, _ in decide(found, facts, limits()).alternatives] == [A, B]
 
 

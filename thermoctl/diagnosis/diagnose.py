@@ -141,7 +141,6 @@ def decided(sought: Sought) -> Diagnosis:
         known=posterior.something if chosen or not asked else 0.0,
         named=named,
         over_noise=1.0 if sensors else max(after.over_noise.values()),
-        worth=_ratio(value.after, value.refit_only) if checked else 1.0,
         apart=max((rms / value.noise[o] for o, rms in value.after.items()), default=0.0) if checked else 0.0,
         remains=0.0 if sensors else remains,
         worse=value.worse if checked else 0.0,
@@ -221,9 +220,3 @@ def _laws(
             without = max(fewer, key=lambda w: w.score)
             gain, other = tried[mine].score - without.score, without.fitted
             yield found_law(known, best, law, other, gain, posterior.effects[key], asked.get(key, 1.0))
-
-
-def _ratio(after: Mapping[str, float], before: Mapping[str, float]) -> float:
-    """Return the rms over outputs of the ratio of their rms errors; infinite if a simulation failed."""
-    pairs = [(after.get(o, float("inf")), before[o]) for o in before if before[o] > 0]
-    return (sum((a / b) ** 2 for a, b in pairs) / max(len(pairs), 1)) ** 0.5

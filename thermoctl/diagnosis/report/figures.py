@@ -27,12 +27,11 @@ COLUMNS = {
     "held_out_after": "held out: extended",
 }
 # Numbers of a decision that are ratios; the others are probabilities.
-RATIOS = ("over_noise", "worth", "apart")
+RATIOS = ("over_noise", "apart")
 MEANINGS = {
     "something": "probability that an effect or an unknown law is missing",
     "known": "probability that an effect is missing that other data confirm",
     "over_noise": "largest residual (rms) over its sensor's noise",
-    "worth": "held-out error, extended over refitted (1 where nothing was set aside)",
     "apart": "largest error (rms) on recordings set aside over its sensor's noise (0 where none was)",
     "worse": "probability that held-out data are predicted worse by the extended plant",
     "remains": "probability that an output still has a systematic error (those that rest on steps of rounding left out)",

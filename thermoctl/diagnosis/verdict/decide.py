@@ -34,7 +34,6 @@ class Facts:
     - `known`: the same; 0 if other data confirmed no effect or law
     - `named`: effects whose own probability is high enough
     - `over_noise`: the largest ratio of a residual to its sensor's noise
-    - `worth`: held-out error with the findings, divided by that of the refitted plant
     - `worse`: probability that the held-out error is larger with the findings
     - `remains`: the largest probability of a remainder at an output
     - `flow`: probability that a flow is missing which no output shows alone
@@ -44,7 +43,6 @@ class Facts:
     known: float
     named: tuple[Key, ...]
     over_noise: float
-    worth: float
     worse: float = 0.0
     remains: float = 0.0
     flow: float = 0.0
