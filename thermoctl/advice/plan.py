@@ -25,7 +25,7 @@ from thermoctl.diagnosis.evidence.fit import UNIFORM, as_refitted, fitted
 from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, courses, family, levers
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, sized, visible
+from thermoctl.diagnosis.report.unseen import NOT_EXCITED, Visible, visible
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import default_noise
@@ -112,7 +112,7 @@ def plan(
 
 def _at_rest(plant: Plant, effects: Mapping[str, Effect], seen: set[Key]) -> list[Visible]:
     """Return the effects that have a place in the plant only while other inputs move."""
-    placed = {c.key: c for c in candidates(made_rig(plant), effects) if sized(c.effect) and c.key not in seen}
+    placed = {c.key: c for c in candidates(made_rig(plant), effects) if c.effect.sizes and c.key not in seen}
     return [Visible(c, "", np.inf, NOT_EXCITED) for c in placed.values()]
 
 

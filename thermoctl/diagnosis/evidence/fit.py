@@ -157,11 +157,10 @@ def _is_of_recordings(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) ->
 
 def significance(f: Fitted, e: Placed) -> float:
     """Return the square of the distance of an effect from none, in standard deviations of noise."""
-    effect = e.candidate.effect
-    fading = [p for p in effect.parameters if e.own.get(p.name) in f.sd and p.fades(effect.shapes)]
-    if _is_of_recordings(f, e, fading):
-        return max(_distance(f, e, p) ** 2 for p in fading)
-    return _away(f, e, fading)
+    sizes = [p for p in e.candidate.effect.sizes if e.own.get(p.name) in f.sd]
+    if _is_of_recordings(f, e, sizes):
+        return max(_distance(f, e, p) ** 2 for p in sizes)
+    return _away(f, e, sizes)
 
 
 def _away(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> float:

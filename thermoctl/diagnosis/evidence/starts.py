@@ -98,8 +98,8 @@ def beside_parent(posterior: Posterior, parent: Keys, fit: Fit) -> np.ndarray:
         e.own[p.name]: p.null + SHARE * (plant[e.own[p.name]].value - p.null)
         for e in posterior.effects
         if e.key not in parent
-        for p in e.candidate.effect.parameters
-        if e.own.get(p.name) in plant and p.fades(e.candidate.effect.shapes)
+        for p in e.candidate.effect.sizes
+        if e.own.get(p.name) in plant
     }
     z = problem.start(small)
     place = {unknown: k for k, unknown in enumerate(problem.unknowns)}

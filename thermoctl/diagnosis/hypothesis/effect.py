@@ -67,6 +67,8 @@ SHAPES: Mapping[str, tuple[str, ...]] = {
 """The kinds of shapes, and the names of the values that each kind has in `shape:` and `trial:`."""
 UNITS_OF = ("unit_of_y", "unit_of_rate", *(f"unit_of_{signal}" for signal in "vxuaiT"))
 """Units of parameters that depend on the place: those of its reading, its flow, and its signals."""
+SIZES = {"times", "lags", "delays", "small_levels"}
+"""Kinds of shapes that are a size: at 0 there is no effect."""
 FORMS = ("rate", "value", "voltage", "storage", "drive", "resistance")
 PARTS = {
     "flow": (("rate",), ("from", "into")),
@@ -109,10 +111,6 @@ class EffectParameter:
         """Does its trial value depend on an amplitude?"""
         return _amplitudes(self.trial) > 0
 
-    def fades(self, shapes: Mapping[str, str]) -> bool:
-        """Is the effect absent if this parameter has its null value? `shapes`: those of its effect."""
-        return self.amplitude or shapes.get(self.shape or "") in ("small_levels", "lags", "delays")
-
 
 @dataclass(frozen=True)
 class Effect:
@@ -133,6 +131,12 @@ class Effect:
     prior: Expr | None = None  # -2 log prior of its parameters, inside their bounds
     contains: str | None = None  # the simpler effect that it is for some values of its parameters
     reads: tuple[str, ...] = ()  # names of nodes and inputs that it reads: an effect for one plant
+
+    @cached_property
+    def sizes(self) -> tuple[EffectParameter, ...]:
+        """The parameters at whose null values it is absent; a limit of a drive or of a reading has none."""
+        amplitudes = tuple(p for p in self.parameters if p.amplitude)
+        return amplitudes or tuple(p for p in self.parameters if self.shapes.get(p.shape or "") in SIZES)
 
     @cached_property
     def in_air(self) -> bool:

@@ -20,7 +20,6 @@ from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.noise import Averaged
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
-from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, parameter_values
 from thermoctl.diagnosis.search.metric import Metric, Plain
@@ -30,8 +29,6 @@ from thermoctl.diagnosis.search.screen import Group, Norms, directions, groups_o
 SEEN = 5.0  # an effect shows if its size is this many standard errors
 ABSORBED = 1e-4  # an effect is imitated if the projection leaves less than this share of its direction's norm
 STILL = 1e-9  # an effect is not excited if its whitened direction has a smaller norm
-# Kinds of shapes that are a size: at 0 there is no effect.
-SIZES = {"times", "lags", "delays", "small_levels"}
 NOT_EXCITED = "these inputs do not excite it"
 IMITATED = "the plant's own parameters imitate it"
 TOO_LARGE = "its largest size would not show"
@@ -74,7 +71,7 @@ class Visible:
 def not_seen(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return `not_seen` of a result: the smallest size of each effect that would have shown."""
     null = next(w.fitted for w in diagnosis.searched.tried if not w.fitted.hypothesis.effects)
-    norms = [n for n in diagnosis.searched.norms if sized(n.column.candidate.effect)]
+    norms = [n for n in diagnosis.searched.norms if n.column.candidate.effect.sizes]
     seen = _best((n, None) for n in norms) if norms else visible(diagnosis.case, null, diagnosis.null.average)
     return [v.entry() for v in seen if v.reason is None]
 
@@ -86,17 +83,12 @@ def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
     metric = Metric(Plain(case, null.rough), average, True)
     rig = case.rig(null.rough_plant, metric.drives)
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
-    placed = [c for c in candidates(rig, case.catalogue) if sized(c.effect)]
+    placed = [c for c in candidates(rig, case.catalogue) if c.effect.sizes]
     return _best(_norms(metric, trajectories, (g for c in placed for g in groups_of(c, metric))))
 
 
 Rms = Mapping[str, tuple[float, float]]
 """By output, the rms change that a direction causes at s = 1, and the output's span."""
-
-
-def sized(effect: Effect) -> bool:
-    """Return whether an effect has a size that can be small. A limit of a drive or of a reading has none."""
-    return any(p.amplitude for p in effect.parameters) or bool(SIZES & set(effect.shapes.values()))
 
 
 def _best(norms: Iterable[tuple[Norms, Rms | None]]) -> list[Visible]:
@@ -146,22 +138,21 @@ def _energies(metric: Metric, plain: np.ndarray) -> dict[int, np.ndarray]:
 def _visible(n: Norms, rms: Rms | None) -> Visible:
     """Return the smallest visible size of a column, and the output that it moves most if `rms` is known."""
     c, shape, dim = n.column.candidate, n.column.shape, n.column.dim
-    sizes = [p for p in c.effect.parameters if p.amplitude]
     if n.whole < STILL:
         return Visible(c, "", np.inf, NOT_EXCITED)
     if n.left < ABSORBED * n.whole:
         return Visible(c, "", np.inf, IMITATED)
     times = SEEN / n.left  # the smallest size as a multiple of that at s = 1
-    if sizes:
+    if any(p.amplitude for p in c.effect.sizes):
         absent = parameter_values(c, shape, [0.0 for _ in dim])
         values = parameter_values(c, shape, [times * v for v in dim])
-        p = next(p for p in sizes if values[p.name] != absent[p.name])
+        p = next(p for p in c.effect.sizes if values[p.name] != absent[p.name])
         smallest = abs(values[p.name] - absent[p.name])
         too_large = smallest > max(abs(np.array(c.bounds(p)) - absent[p.name]))
     else:
         # A lag, delay or dead zone: the outputs change in proportion to it near a value of the grid.
         times = max(times, 1 / NEAR)
-        p = next(p for p in c.effect.parameters if p.shape)
+        p = c.effect.sizes[0]
         smallest, too_large = shape[str(p.shape)] * times, n.left < SEEN
     if too_large:
         return Visible(c, p.name, smallest, TOO_LARGE)
