@@ -10,6 +10,8 @@ import pytest
 import yaml
 
 from tests.diagnose.changes import Given, kelvin, milliwatt, names, order
+from tests.plants import ONE_BLOCK
+from thermoctl.cli import main
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
@@ -18,8 +20,9 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
-from thermoctl.plant import from_plain, loads
+from thermoctl.plant import from_plain, load, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -301,3 +304,15 @@ def test_what_is_made_of_a_set_point_is_limited_and_not_the_set_point(effect, li
     assert (found["effect"], found["where"]) == (effect, "follow")
     (u,) = found["parameters"].values()
     assert abs(u["value"] - level) < 0.03 * level and u["unit"] == "mm/s"
+
+
+@pytest.mark.parametrize("unit", ["degF", "mK"])
+def test_a_plant_in_other_degrees_is_refused_by_its_check_and_by_a_diagnosis(tmp_path, capsys, unit):
+    """Radiation at a node in degF was (block + 273.15)**4 with the block in degF, without a word."""
+    path, t = tmp_path / "plant.yaml", np.arange(100.0)
+    path.write_text(ONE_BLOCK.replace("degC", unit))
+    table = Table("run", "run", t, {"heat": 0 * t, "air": 70 + 0 * t, "temperature": 70 + 0.1 * np.sin(t)})
+    with pytest.raises(InputError, match=f"'air' is in {unit}, .* degC or K only"):
+        diagnose(load(path), [table], catalogue(), limits(), ())
+    assert main(["plant", "check", str(path)]) == 1
+    assert f"'block' is in {unit}, and effects know temperatures in degC or K only" in capsys.readouterr().out

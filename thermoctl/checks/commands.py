@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TextIO
 
 from thermoctl.checks import Finding, checks
-from thermoctl.checks.file import file_findings
+from thermoctl.checks.file import file_findings, other_degrees
 from thermoctl.checks.hung import without_hung
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, commands, load
@@ -34,7 +34,7 @@ def check(args: argparse.Namespace) -> int:
             f"{len(p.flows)} flows, {len(p.outputs)} outputs"
         )
         if args.data:
-            _, findings = checked(p, args.data, args)
+            findings = [*other_degrees(p), *checked(p, args.data, args)[1]]
             report(findings, sys.stdout)
             if not findings:
                 print("the recordings fit the plant's labels, units and clock")

@@ -12,8 +12,8 @@ from thermoctl.checks.model import jacobian, storage_findings, unit_findings, va
 from thermoctl.plant import Plant
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr
-from thermoctl.plant.language import Flow, Input, Node
-from thermoctl.units import size_of
+from thermoctl.plant.language import Flow, Input, Node, Output
+from thermoctl.units import conversion, dimension, size_of
 
 _TEMPERATURES = ("degC", "K", "degF")
 POINTS = 3  # random values at which an expression is tried
@@ -24,11 +24,30 @@ HOMOGENEOUS = 1e-9  # relative error of Euler's theorem
 def file_findings(plant: Plant) -> list[Finding]:
     """Return warnings of a plant file; no recording is needed."""
     return [
+        *other_degrees(plant),
         *unit_findings(plant),
         *(f for f, _ in unconverted(plant)),
         *_storages(plant),
         *_signs(plant),
         *_scales(plant),
+    ]
+
+
+def other_degrees(plant: Plant) -> list[Finding]:
+    """Return a severe finding for each temperature in neither degC nor K.
+
+    Effects add 273.15 to degrees, and take each difference for kelvins: radiation would be wrong in degF."""
+    items: list[Input | Node | Output] = [*plant.inputs.values(), *plant.nodes.values()]
+    items += plant.outputs.values()
+    return [
+        Finding(
+            "unit",
+            f"{plant.file}:{q.at}",
+            f"'{q.name}' is in {q.unit}, and effects know temperatures in degC or K only",
+            f"State it in one of these; its column may be in any unit: column: {{name: ..., unit: {q.unit}}}.",
+        )
+        for q in items
+        if q.unit and dimension(q.unit) == dimension("K") and conversion(q.unit, "K")[0] != 1
     ]
 
 

@@ -11,6 +11,7 @@ from threading import Lock
 import numpy as np
 from scipy.special import bdtrc
 
+from thermoctl.checks.file import other_degrees
 from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
 from thermoctl.diagnosis.data.grids import Grid, Reading, grid
@@ -179,7 +180,9 @@ def case(
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
     Rows of long recordings are averaged in blocks (rows.py).
-    Raises InputError where too few values were measured."""
+    Raises InputError where too few values were measured, or a temperature is neither in degC nor in K."""
+    for wrong in other_degrees(plant):
+        raise InputError(f"{wrong.where}: {wrong.what}. {wrong.suggestion}")
     reuse_memory()
     plant, off, freed = _free_starts(plant, tables)
     fewer = reduced(plant, tables)

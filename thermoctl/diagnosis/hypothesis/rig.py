@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SEEN, CORRECT = "seen_", "correct_"  # an observer's inputs and flows (observer.py): no physics
 STRAIGHT = "_straight"  # suffix of the linearly interpolated copy of a held input
-KELVIN = {"K", "kelvin"}
+KELVIN = {"K", "kelvin", "kelvins"}
 ZERO_DEGC = 273.15  # K
 TEMPERATURE = {"degC", "celsius", "degree_Celsius", "delta_degC", "°C", *KELVIN}
 MOVING = ("velocity", "rotation")
