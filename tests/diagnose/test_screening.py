@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
 import pytest
 
-from tests.plants import SPRING_STAGE, TWO_BLOCKS
+from tests.plants import ONE_BLOCK, SPRING_STAGE, TWO_BLOCKS
 from thermoctl.diagnosis.data.case import Budget, case
+from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report.unseen import not_seen
 from thermoctl.diagnosis.search.beam import Search, started
 from thermoctl.diagnosis.search.refits import refitted
 from thermoctl.diagnosis.search.screening import LOUD, Screened, screened
@@ -88,3 +91,19 @@ def test_a_plant_without_unknowns_is_screened_and_refitted():
         + promise(looked, "sensor_offset_step", "temperature_2")
         > 20
     )
+
+
+def test_detection_limits_are_those_of_the_screening_whatever_refit_is_closest():
+    """Where not all columns were screened, their noise was that of the refit that the result shows."""
+    plant, t = loads(ONE_BLOCK), np.arange(400.0)
+    heat = np.repeat([12.0, 0.0, 12.0, 12.0, 0.0], 80)
+    table = compile_plant(plant).measure(Table("run", "run", t, {"heat": heat, "air": 20 + 0 * t}), seed=1)
+    found = diagnose(plant, [table], catalogue(), limits(), ())
+    average = found.null.average
+    louder = dataclasses.replace(average, inverse=[v / 4 for v in average.inverse])
+    other = dataclasses.replace(
+        found,
+        searched=dataclasses.replace(found.searched, norms=()),
+        null=dataclasses.replace(found.null, average=louder),
+    )
+    assert len(not_seen(found)) > 10 and not_seen(other) == not_seen(found)

@@ -21,7 +21,7 @@ from thermoctl.advice.effect_files import made_rig
 from thermoctl.checks import Finding
 from thermoctl.checks.model import plant_findings, rates_of
 from thermoctl.diagnosis.data.case import Budget, case
-from thermoctl.diagnosis.evidence.fit import UNIFORM, as_refitted, fitted
+from thermoctl.diagnosis.evidence.fit import UNIFORM, fitted
 from thermoctl.diagnosis.experiment.design import NONE, Excitation, Lever, Ranges, courses, family, levers
 from thermoctl.diagnosis.hypothesis.candidates import Key, candidates
 from thermoctl.diagnosis.hypothesis.effect import Effect
@@ -97,7 +97,7 @@ def plan(
     planned_case = case(plant, made, effects, Budget(1))
     null = fitted(planned_case, planned_case.plant, (), planned_case.null)
     rates = np.concatenate([rates_of(model, d) for d in drives])
-    seen = visible(planned_case, null, as_refitted(planned_case, null).average)
+    seen = visible(planned_case, null)
     return Planned(
         plant_findings(model, drives),
         float(sum(t.t[-1] - t.t[0] for t in made)),

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.evidence.noise import Averaged
+from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.gains import NEAR, parameter_values
@@ -72,15 +71,16 @@ def not_seen(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return `not_seen` of a result: the smallest size of each effect that would have shown."""
     null = next(w.fitted for w in diagnosis.searched.tried if not w.fitted.hypothesis.effects)
     norms = [n for n in diagnosis.searched.norms if n.column.candidate.effect.sizes]
-    seen = _best((n, None) for n in norms) if norms else visible(diagnosis.case, null, diagnosis.null.average)
+    seen = _best((n, None) for n in norms) if norms else visible(diagnosis.case, null)
     return [v.entry() for v in seen if v.reason is None]
 
 
-def visible(case: Case, null: Fitted, average: Averaged) -> list[Visible]:
+def visible(case: Case, null: Fitted) -> list[Visible]:
     """Return the smallest visible size of every effect at every place, by effect and place.
 
-    `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts."""
-    metric = Metric(Plain(case, null.rough), average, True)
+    `null`: the refit of the plant alone. Of several variants and parameters the most visible one counts. The
+    noise is that of the first screening."""
+    metric = Metric(Plain(case, null.rough), as_refitted(case, null).average, True)
     rig = case.rig(null.rough_plant, metric.drives)
     trajectories = [Trajectory(metric, rig, r) for r in range(len(metric.drives))]
     placed = [c for c in candidates(rig, case.catalogue) if c.effect.sizes]
