@@ -131,6 +131,14 @@ def test_agreement_with_a_likely_effect_is_not_called_nothing_missing():
     assert "Record more, with wider steps" in perhaps and "nothing is missing" not in perhaps.lower()
 
 
+def test_the_best_experiment_is_named_beside_what_would_help_more():
+    """After a sentence on a sensor stood "The best one inside them", as if it had told of limits."""
+    helpful = "A sensor of its own at block would tell more (1.20 bits with the same experiment)."
+    proposed = {"profile": "heat in slow trapezoids, 20 min", "also_helpful": helpful}
+    next_step = what_next(FOUND | {"verdict": "ambiguous", "next_experiment": proposed})
+    assert next_step == f"{helpful} The best experiment of those tried: {proposed['profile']}."
+
+
 def test_the_reasons_of_a_folder_without_a_diagnosis_are_refused(tmp_path, capsys):
     assert main(["diagnose", "--explain", str(tmp_path)]) == 2
     assert "no such file" in capsys.readouterr().err

@@ -65,7 +65,7 @@ def what_next(result: Result) -> str:
     """Return the next step for a person."""
     proposed = result.get("next_experiment")
     if proposed and proposed.get("also_helpful"):
-        return f"{proposed['also_helpful']} The best one inside them: {proposed['profile']}."
+        return f"{proposed['also_helpful']} The best experiment of those tried: {proposed['profile']}."
     if proposed:
         return (
             f"Run the proposed experiment ({proposed['profile']}) and diagnose again with its recording; "
