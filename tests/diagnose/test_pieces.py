@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from tests.laws.published import SYSTEMS
 from tests.plants import TWO_BLOCKS
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
-from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.diagnose import diagnose, sought
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.plant import loads
@@ -111,3 +111,12 @@ def test_nothing_is_missing_where_a_chaotic_plant_has_its_parameters_a_little_wr
     found = diagnose(*beam, catalogue(), limits())
     assert found.decision.verdict == "consistent"
     assert found.null.fit.rms()["X"] < 0.031
+
+
+def test_a_recording_set_aside_that_was_cut_is_noted_too(beam):
+    """The report did not say that errors on it are those of its pieces."""
+    plant, tables = beam
+    (cut,) = [t for t in tables if in_pieces(plant, [t])[1]]
+    whole = [t for t in tables if t is not cut]
+    notes = sought(plant, whole, {}, limits(), [cut]).case.notes
+    assert [n for n in notes if n.startswith(f"a free run of {cut.name} forgets its start")]

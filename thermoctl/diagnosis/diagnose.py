@@ -91,7 +91,7 @@ def sought(
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
-    known.notes.extend([*hung, *notes])
+    known.notes.extend([*hung, *notes, *more])
     searched = with_laws(known, search(known, numbers), numbers, say)
     return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
 
