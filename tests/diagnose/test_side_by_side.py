@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
 
 from tests.diagnose.test_workers import rig
+from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import refits
+from thermoctl.plant import loads
 from thermoctl.plant.fitting import cores
+from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 
 def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
@@ -54,3 +61,23 @@ def test_items_that_are_split_again_are_taken_one_after_the_other(monkeypatch):
     )
     cores._pool.cache_clear()
     assert found == [6 * x for x in range(8)]
+
+
+def test_two_threads_respond_for_one_recording_with_a_delayed_output():
+    """Both wrote into one buffer: five of 80 responses were wrong."""
+    model, t = (
+        compile_plant(loads(ONE_BLOCK.replace("value: block,", "value: 'delay(block, 8)',"))),
+        np.arange(3000.0),
+    )
+    columns = {"heat": 9 * np.sin(t / 50) ** 2, "air": 20 + 0 * t, "temperature": 20 + 0 * t}
+    d = model.prepare(model.excitation(Table("run", "", t, columns)))
+    flows = np.random.default_rng(0).standard_normal((8, 3000, 96))
+    buffers = {}
+
+    def response(q):
+        """Return the sum of the responses to flows (N, 96)."""
+        return model.respond(d, None, None, [(0, k) for k in range(96)], q, 96, buffers=buffers).sum()
+
+    alone = list(map(response, flows))
+    with ThreadPoolExecutor(2) as pool:
+        assert [list(pool.map(response, flows)) for _ in range(10)] == [alone] * 10

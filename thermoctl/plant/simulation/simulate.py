@@ -486,7 +486,7 @@ class Model:
             delayed, slopes = self._shift(excitation.t, g, dg, p, own)
         y, dy = np.empty((n, ny)), None
         if sensitivities:
-            y, dy = self._outputs(excitation, nq, buffers)
+            y, dy = self._outputs(excitation, nq, buffers, "" if own else _own("dy"))
         _call(lib.observe, 0, *known, delayed, slopes, y, dy, own)
         return y, dy
 
