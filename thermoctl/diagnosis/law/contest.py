@@ -173,10 +173,10 @@ def _more(s: Search, base: Weighed, f: Fitted) -> None:
     for k, law in enumerate(laws):
         others = [*laws[:k], *laws[k + 1 :]]
         try:
-            more = more_terms(s.case, f, law, s.limits) if len(law.terms) < TERMS else []
+            more = more_terms(s.case, f, law, s.limits)
         except (SimulationError, np.linalg.LinAlgError):
             more = []
-        for p in more:
+        for p in (p for p in more if len(p.terms) <= TERMS):
             _keep_laws(s, base, [p, *others])
 
 

@@ -57,6 +57,7 @@ CHUNK = 256  # number of terms whose responses are computed at a time
 NEEDED = 15.0  # nats that free flows into two nodes need beside one: two terms of a law are not likelier
 # Number of terms of each law of a pair; number of pairs, and of those that hold the same law.
 EACH, COUPLES, SHARED = 8, 6, 2
+WIDTH = 0.05  # width of a switch, in typical sizes of its signal (config/laws.yaml)
 ADDED = 4  # number of terms of a law's own signals that are added to it
 PLAIN = (
     "constant",
@@ -156,7 +157,8 @@ def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list
     """Return a refitted law with one more term of its own signals, best first. Raises SimulationError.
 
     `law`: at its refitted values. A law of the library is rarely exact: an effect of the catalogue must not
-    explain what another form of the law does."""
+    explain what another form of the law does. So switches of a free width come first, with and without the
+    other terms."""
     linear = at_refit(case, f)
     own = list(dict.fromkeys(s for t in law.terms for s in t.signals))
     out = []
@@ -167,7 +169,25 @@ def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list
         out.append(
             dataclasses.replace(law, terms=terms, sizes=(*law.sizes, *map(float, sizes)), promise=promise)
         )
-    return sorted(out, key=lambda p: -p.score)[:ADDED]
+    return _softened(law) + sorted(out, key=lambda p: -p.score)[:ADDED]
+
+
+def _softened(law: Proposal) -> list[Proposal]:
+    """Return a law whose switches are steps of a free width, with and without its other terms."""
+    form = next(f for f in library() if f.name == "logistic")
+    first = np.cumsum([0, *(len(t.form.sizes) for t in law.terms)])
+    soft = {
+        k: dataclasses.replace(t, form=form, shapes={**t.shapes, "s": WIDTH})
+        for k, t in enumerate(law.terms)
+        if t.form.name == "switch"
+    }
+    if not soft:
+        return []
+    every = tuple(soft.get(k, t) for k, t in enumerate(law.terms))
+    alone = tuple(law.sizes[first[k]] for k in soft)
+    whole = dataclasses.replace(law, terms=every)
+    rest = len(soft) < len(every)
+    return [whole, *([dataclasses.replace(law, terms=tuple(soft.values()), sizes=alone)] if rest else [])]
 
 
 def _in_turn(
@@ -283,8 +303,8 @@ def _singles(
     others = [s for s in every if s not in first]
     tried += [f for f in families(others, every, duration, sample) if f.form.of in SLIGHT]
     tried = [f for f in tried if not new or _reads((f,), new)]
-    if place.part in ("storage", "parameter"):
-        tried = [f for f in tried if not f.form.memory]  # a capacity remembers nothing
+    if place.part != "flow":  # a capacity remembers nothing, and a reading that does is a slow sensor
+        tried = [f for f in tried if not f.form.memory]
     if place.part == "reading":
         tried = [f for f in tried if f.form.name not in PLAIN]
     for part in chunks(tried, lambda f: f.count, CHUNK):
