@@ -141,7 +141,7 @@ def test_the_best_experiment_is_named_beside_what_would_help_more():
 
 def test_the_reasons_of_a_folder_without_a_diagnosis_are_refused(tmp_path, capsys):
     assert main(["diagnose", "--explain", str(tmp_path)]) == 2
-    assert "no such file" in capsys.readouterr().err
+    assert "No such file" in capsys.readouterr().err
     (tmp_path / "diagnosis.json").write_text(json.dumps({"verdict": "explained"}))
     assert main(["diagnose", "--explain", str(tmp_path)]) == 2
     assert "older version" in capsys.readouterr().err

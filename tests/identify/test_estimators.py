@@ -307,7 +307,7 @@ def test_a_calibration_that_does_not_fit_is_refused(tmp_path):
         ("model.A_minus_I", [["-0.1"]], "A_minus_I holds something that is no number"),
         ("model.R_v", "1.0", "R_v is '1.0', expected a number above 0"),
         ("model.f1", float("nan"), "f1 is nan, expected a finite number"),
-        ("model.period_s", 10**400, "cannot be read as int"),
+        ("model.period_s", 10**400, "too large"),
         ("model.sensors", None, "not the entries of a model of this version"),
         ("model.points", [1] * 12, "12 points with 12 names"),
         ("model.gain_of_old", 1.0, "not the entries of a model of this version"),

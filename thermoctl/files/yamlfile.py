@@ -176,18 +176,18 @@ def _convert(node: yaml.Node, loader: _Loader | _Fast, file: str, depth: int) ->
     if standard == "tag:yaml.org,2002" and kind in ("str", "int", "float", "bool", "null"):
         try:
             if kind == "int":
-                return Node(_whole(node.value), file, line, column)
+                return Node(_whole(node.value, place), file, line, column)
             return Node(loader.construct_object(node), file, line, column)
         except (ValueError, yaml.YAMLError):
             raise InputError(f"{place}: '{node.value}' cannot be read as {kind}") from None
     raise InputError(f"{place}: the tag {node.tag} is not allowed here")
 
 
-def _whole(text: str) -> int:
+def _whole(text: str, place: str) -> int:
     number = int(text.replace("_", ""))
     if abs(number) < MAX_NUMBER:
         return number
-    raise ValueError
+    raise InputError(f"{place}: the number is too large; one below {MAX_NUMBER:g} was expected")
 
 
 def _refuse_commas(node: yaml.MappingNode, file: str) -> None:
