@@ -240,9 +240,8 @@ bench-published: develop           # systems of published papers: the diagnosis 
 	$(BIN)/python -m tests.bench.published
 
 .PHONY: prove-laws
-prove-laws: develop                # concealed laws that the catalogue lacks: 102 cases and 40 without a law; half an hour and more; run again to continue
+prove-laws: develop                # concealed laws that the catalogue lacks: 102 cases and 40 without a law; an hour and more; run again to continue
 	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws)
-	$(BIN)/python -m tests.laws.prove --out $(or $(PROOF),build/proof/laws) --table
 
 .PHONY: laws-recordings
 laws-recordings: develop           # laws of real rigs beside the published form; RECORDINGS= the folder of rigs

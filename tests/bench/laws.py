@@ -5,7 +5,7 @@
 Every method is given the true place. The peers fit the smoothed flow there (`smooth.tracked` with that node alone) over the
 signals of the place:
 
-thermoctl   the diagnosis without its catalogue, which has to find the place itself
+thermoctl   the whole diagnosis, which has to find the place itself
 sindy       PySINDy's STLSQ on a library of polynomials to the third degree
 gplearn     symbolic regression with abs, sqrt, log, inverse, products; parsimony 0.01
 gp          Gaussian process with one length scale for each signal: no law, the bar for any function
@@ -168,7 +168,7 @@ def main() -> None:
     rows: dict[str, list[dict]] = {m: [] for m in ("thermoctl", *PEERS)}
     for name, law, family, size, world, seed in [c for c in cases() if c[1]][: args.number]:
         made = make(law, family, size, world, seed)
-        ours = judge(made, False)
+        ours = judge(made)
         rows["thermoctl"].append(
             {
                 "variable": bool(ours.get("variable")),

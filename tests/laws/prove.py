@@ -1,10 +1,9 @@
 """Concealed laws that no entry of the catalogue holds: place, variable, law, worth, false claims.
 
-    python -m tests.laws.prove --out DIR [--full] [--shard K/N] [--limit N]      # one line of JSON for each case
-    python -m tests.laws.prove --out DIR --table                                 # docs/proof/laws.md
+    python -m tests.laws.prove --out DIR [--number N] [--workers N]    # one line of JSON for each case, then the table
 
-Without --full the law is looked for in what a refit of the plant leaves. With --full the whole diagnosis runs, and the
-catalogue may take the law's place. Lines of an earlier run are kept: run again to continue."""
+The whole diagnosis runs, in which entries of the catalogue compete with laws. Lines of an earlier run are kept: run
+again to continue."""
 
 from __future__ import annotations
 
@@ -12,6 +11,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,19 +64,17 @@ def cases() -> list[tuple[str, Truth | None, str, str, str, int]]:
     return [out[i] for i in rng.permutation(len(out))]
 
 
-def judge(made: Made, full: bool) -> dict[str, Any]:
-    """Look for the law of one case, and compare with its truth."""
+def judge(made: Made) -> dict[str, Any]:
+    """Diagnose one case, and compare with its truth."""
     started = time.process_time()
-    numbers = limits()
-    d = diagnose(made.plant, made.tables[:3], catalogue() if full else {}, numbers)
-    law, plant, null = d.law, d.final.plant, d.null.plant
-    named = [f"{e.key[0]} at {e.key[1]}" for e in d.shown]
-    verdict = d.decision.verdict
+    d = diagnose(made.plant, made.tables[:3], catalogue(), limits())
+    law = max(d.laws, key=lambda found: _at_place(found, made), default=None)
+    plant, null = d.final.plant, d.null.plant
     out: dict[str, Any] = {
         "seconds": round(time.process_time() - started, 1),
-        "verdict": verdict,
-        "named": named,
-        "claimed": law is not None,
+        "verdict": d.decision.verdict,
+        "named": [f"{e.key[0]} at {e.key[1]}" for e in d.shown if e.key in d.decision.named],
+        "claimed": len(d.laws),
         "ratio": made.ratio,
         "law": str(law_rate(law.fitted, law.placed)) if law else None,
         "forms": [t.form.name for t in law.proposal.terms] if law else None,
@@ -88,12 +86,18 @@ def judge(made: Made, full: bool) -> dict[str, Any]:
     closed = [1 - x / max(e[0], 1e-9) for x in e[1:]]
     out |= {"closed": closed[0], "oracle": closed[1], "difference": difference(plant, made)}
     if law:
-        place = law.proposal.place
-        nodes = {made.law.target, made.law.source} - {None}
-        out["place"] = ({*place.nodes}, place.part) == (nodes, made.law.part)
+        out["place"] = _at_place(law, made)
         out["variables"] = sorted(_variables(law, made))
         out["variable"] = set(out["variables"]) == made.law.variables - AMBIENT
     return out
+
+
+def _at_place(law: FoundLaw, made: Made) -> bool:
+    """Return whether a law is where the truth has its own."""
+    if made.law is None:
+        return False
+    place, nodes = law.proposal.place, {made.law.target, made.law.source} - {None}
+    return ({*place.nodes}, place.part) == (nodes, made.law.part)
 
 
 def _with_range(truth: Plant) -> Plant:
@@ -152,7 +156,6 @@ def _signals(plant: Plant, table: Table) -> dict[str, Any]:
 def difference(plant: Plant, made: Made) -> float:
     """Rms difference of the rates dx/dt at the law's place, along the truth's last run, over that of the law."""
     trajectory = _signals(made.truth, made.tables[-1])
-    trajectory |= _memories(plant, trajectory, trajectory["t"])
 
     def net(p: Plant) -> np.ndarray:
         known = {**trajectory, **{k: v.value for k, v in p.parameters.items()}}
@@ -165,6 +168,7 @@ def difference(plant: Plant, made: Made) -> float:
         return total / np.asarray(ex.evaluate(p.nodes[made.law.target].storage, known), float)
 
     try:
+        trajectory |= _memories(plant, trajectory, trajectory["t"])
         with np.errstate(all="ignore"):
             delta, own = net(plant) - net(made.truth), net(without(made.truth)) - net(made.truth)
     except KeyError:  # an effect that is named beside the law adds a state, which the truth lacks
@@ -233,7 +237,14 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
             f"{100 * float(np.median(ratio)) if ratio else 0:.0f} %",
         ),
         row("equivalent law, of all", "60 %", share(shown, [r for r in claimed if r["difference"] < EQUAL])),
+        row("an effect of the catalogue named too", "", share(shown, [r for r in claimed if r["named"]])),
+        row(
+            "an effect named in its place",
+            "",
+            share(shown, [r for r in shown if r["named"] and not r["claimed"]]),
+        ),
         row("a law claimed where none is", "2 %", share(none, [r for r in none if r["claimed"]])),
+        row("an effect named where none is", "2 %", share(none, [r for r in none if r["named"]])),
         row(
             "processor time, median",
             "60 s",
@@ -255,37 +266,40 @@ def table(lines: Sequence[dict[str, Any]]) -> str:
     return "\n".join(out) + "\n"
 
 
+def _line(case: tuple[str, Truth | None, str, str, str, int]) -> dict[str, Any]:
+    """Make and judge one case; an error is a line of the result, too."""
+    name, law, family, size, world, seed = case
+    try:
+        result = judge(make(law, family, size, world, seed))
+    except Exception as e:
+        result = {"error": f"{type(e).__name__}: {e}"[:300]}
+    return {"case": name, "truth": law.rate if law else None, **result}
+
+
 def main() -> None:
-    """Run the cases of a shard, or print the table."""
+    """Run the cases that an earlier run left, and print the table."""
     p = argparse.ArgumentParser()
     p.add_argument("--out", type=Path, required=True)
-    p.add_argument("--full", action="store_true")
-    p.add_argument("--shard", default="0/1")
-    p.add_argument("--limit", type=int, default=10**6)
-    p.add_argument("--table", action="store_true")
+    p.add_argument("--number", type=int)
+    p.add_argument("--workers", type=int, default=2)
     args = p.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    kind = "full" if args.full else "law"
-    lines = [
-        json.loads(x) for f in sorted(args.out.glob(f"{kind}_*.jsonl")) for x in f.read_text().splitlines()
-    ]
-    if args.table:
-        print(table(lines))
-        return
-    k, n = map(int, args.shard.split("/"))
+    kept = args.out / "laws.jsonl"
+    kept.touch()
+    lines = [json.loads(x) for x in kept.read_text().splitlines()]
     done = {r["case"] for r in lines}
-    with (args.out / f"{kind}_{k}.jsonl").open("a") as file:
-        for name, law, family, size, world, seed in cases()[k::n][: args.limit]:
-            if name in done:
-                continue
-            try:
-                result = judge(make(law, family, size, world, seed), args.full)
-            except Exception as e:  # a case that cannot be made or diagnosed is a line of the result, too
-                result = {"error": f"{type(e).__name__}: {e}"[:300]}
-            line = {"case": name, "truth": law.rate if law else None, **result}
-            file.write(json.dumps(line) + "\n")
-            file.flush()
-            print(json.dumps({k: v for k, v in line.items() if k != "truth"}), flush=True)
+    left = [c for c in cases()[: args.number] if c[0] not in done]
+    with kept.open("a") as file, ProcessPoolExecutor(args.workers, max_tasks_per_child=1) as pool:
+        for future in as_completed([pool.submit(_line, c) for c in left]):
+            lines.append(future.result())
+            print(json.dumps(lines[-1]), file=file, flush=True)
+            print(json.dumps({k: v for k, v in lines[-1].items() if k != "truth"}), flush=True)
+    failed = [r for r in lines if "error" in r]
+    print(
+        table([r for r in lines if r not in failed]),
+        *(f"{r['case']}: {r['error']}" for r in failed),
+        sep="\n",
+    )
 
 
 if __name__ == "__main__":
