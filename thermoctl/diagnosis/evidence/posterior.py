@@ -21,7 +21,6 @@ from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, Keys
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.climb import Climbed, Spot, climb
-from thermoctl.plant.fitting.residuals import FAR as FAR  # law/smooth.py, too, has it from here
 from thermoctl.plant.fitting.residuals import HUGE, PROBE, Problem
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import SimulationError, compile_plant

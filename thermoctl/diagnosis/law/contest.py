@@ -35,7 +35,6 @@ from thermoctl.diagnosis.search.beam import (
     swap,
 )
 from thermoctl.diagnosis.search.shortlist import PAIR
-from thermoctl.plant import expression as ex
 from thermoctl.plant.simulation.simulate import SimulationError
 
 
@@ -80,7 +79,7 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
         done = case.budget.fits_done
         _compete(s, _pairs(s, limits), done)
     lead, weighed = s.best, {*s.tried}
-    _make_rarer(s, weighed)
+    _make_rarer(s, weighed)  # another hypothesis may lead now, with effects that its law makes needless
     if s.best.fitted is not lead.fitted:
         _fewer(s)
         _make_rarer(s, s.tried.keys() - weighed)
@@ -263,7 +262,7 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
         some = [
             replace(p, promise=p.promise + more)
             for p in proposals
-            if base is parent or len(p.terms) == 1 and known >= {*p.place.nodes, *_names(p)}
+            if base is parent or len(p.terms) == 1 and known >= {*p.place.nodes, *p.reads}
         ]
         least = replace(goal, least=tuple(x + more for x in goal.least))
         tried = refits(case, base.fitted, some, least, say)
@@ -294,12 +293,6 @@ def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) ->
     if len(rest) == len(effects):
         return None
     return _beside(s, rest, base.fitted)
-
-
-def _names(p: Proposal) -> set[str]:
-    """Return the names that a law's signals and shares read."""
-    read = [s.value for t in p.terms for s in t.signals] + [share for _, share in p.place.shares]
-    return {n for e in read for n in ex.names(e)}
 
 
 def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed | None:

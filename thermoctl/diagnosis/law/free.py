@@ -116,7 +116,7 @@ def _gains(
     for k in np.argsort(-np.array(energies), kind="stable")[:RANKED].tolist():
         place, flows = functions[k]
         x = linear.columns(place, flows())
-        out.append((predicted(linear, x)[0] - cost_of(linear, x.shape[1]), k))
+        out.append((predicted(linear, x)[0], k))
     return sorted(out, key=lambda f: -f[0])
 
 
@@ -156,9 +156,11 @@ def pieces(v: np.ndarray, knots: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(v, knots, row) for row in np.eye(len(knots))], axis=1)
 
 
-def predicted(linear: Tracked, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes."""
+def predicted(linear: Tracked, x: np.ndarray, shapes: int = 0) -> tuple[float, np.ndarray]:
+    """Return the predicted gain in log likelihood of columns x at their best sizes, and these sizes.
+
+    Less what the sizes cost, and `shapes` further parameters."""
     scale = np.linalg.norm(x, axis=0)
     scale[scale == 0] = 1.0
     c = np.linalg.lstsq(x / scale, linear.target, rcond=1e-8)[0] / scale
-    return linear.above(linear.target - x @ c), c
+    return linear.above(linear.target - x @ c) - cost_of(linear, len(c) + shapes), c

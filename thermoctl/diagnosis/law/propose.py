@@ -24,7 +24,6 @@ from thermoctl.diagnosis.law.free import (
     NODES,
     at_refit,
     choices,
-    cost_of,
     energy,
     entered,
     log_number,
@@ -36,8 +35,9 @@ from thermoctl.diagnosis.law.free import (
 from thermoctl.diagnosis.law.signals import Place, Signal, rates
 from thermoctl.diagnosis.law.smooth import Tracked, tracked
 from thermoctl.diagnosis.limits import Thresholds
-from thermoctl.diagnosis.search.again import chunks
+from thermoctl.diagnosis.search.screen import chunks
 from thermoctl.diagnosis.search.shortlist import ALIKE
+from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.residuals import HUGE
 
 # Largest number of nodes with an unknown flow, those that explain the residual best: 24 knots each.
@@ -102,6 +102,12 @@ class Proposal:
         return self.place, tuple(sorted(((t.form.name, t.signals) for t in self.terms), key=str))
 
     @property
+    def reads(self) -> AbstractSet[str]:
+        """Return the names that its signals and shares read."""
+        read = [s.value for t in self.terms for s in t.signals] + [share for _, share in self.place.shares]
+        return {n for e in read for n in ex.names(e)}
+
+    @property
     def shapes(self) -> int:
         """Number of parameters that are not sizes."""
         return sum(len(t.form.shapes) for t in self.terms)
@@ -137,15 +143,15 @@ def propose_laws(case: Case, parent: Fitted, limits: Thresholds) -> list[Proposa
     combos = choices(case, rig, where, linear.likely[:NODES], linear)
     base, pool, kinds = (log_number(combos), limits), list[Found](), list[list[Proposal]]()
     for part, new in _in_turn(rig, [c for c in combos if c[0].part != "reading"]):
-        pool = _best_first([*pool, *_terms(case, rig, linear, ranked(linear, part), COMBINATIONS, new)])
-        kinds.append(_mixed([p for p in _of(linear, pool, base) if not new or _reads(p.terms, new)]))
+        pool = _best_first([*pool, *_terms(case, linear, ranked(linear, part), COMBINATIONS, new)])
+        kinds.append(_mixed([p for p in _composed(linear, pool, base) if not new or _reads(p.terms, new)]))
     linear, read = at_refit(case, parent), [c for c in combos if c[0].part == "reading"]
-    kinds.append(_mixed(_of(linear, _terms(case, rig, linear, ranked(linear, read), COMBINATIONS), base)))
+    kinds.append(_mixed(_composed(linear, _terms(case, linear, ranked(linear, read), COMBINATIONS), base)))
     kinds.sort(key=lambda ps: -max((p.score for p in ps), default=-np.inf))
     return [p for ps in itertools.zip_longest(*kinds) for p in ps if p]
 
 
-def _of(linear: Tracked, pool: Sequence[Found], base: tuple[float, Thresholds]) -> list[Proposal]:
+def _composed(linear: Tracked, pool: Sequence[Found], base: tuple[float, Thresholds]) -> list[Proposal]:
     """Return the laws of one term, and of sums of terms, the best first."""
     out = [_proposal(linear, f.place, (f.term,), f.columns, base) for f in _varied(pool)]
     for place in dict.fromkeys(f.place for f in pool):
@@ -163,8 +169,7 @@ def more_terms(case: Case, f: Fitted, law: Proposal, limits: Thresholds) -> list
     own = list(dict.fromkeys(s for t in law.terms for s in t.signals))
     out = []
     for term in _varied(_best_first(_singles(linear, law.place, own, own, frozenset()))):
-        gain, sizes = predicted(linear, term.columns)
-        promise = gain - cost_of(linear, len(sizes) + len(term.term.form.shapes))
+        promise, sizes = predicted(linear, term.columns, len(term.term.form.shapes))
         terms = (*law.terms, term.term)
         out.append(
             dataclasses.replace(law, terms=terms, sizes=(*law.sizes, *map(float, sizes)), promise=promise)
@@ -185,9 +190,10 @@ def _softened(law: Proposal) -> list[Proposal]:
         return []
     every = tuple(soft.get(k, t) for k, t in enumerate(law.terms))
     alone = tuple(law.sizes[first[k]] for k in soft)
-    whole = dataclasses.replace(law, terms=every)
-    rest = len(soft) < len(every)
-    return [whole, *([dataclasses.replace(law, terms=tuple(soft.values()), sizes=alone)] if rest else [])]
+    out = [dataclasses.replace(law, terms=every)]
+    if len(soft) < len(every):
+        out.append(dataclasses.replace(law, terms=tuple(soft.values()), sizes=alone))
+    return out
 
 
 def _in_turn(
@@ -211,7 +217,6 @@ def _best_first(pool: Sequence[Found]) -> list[Found]:
 
 def _terms(
     case: Case,
-    rig: Rig,
     linear: Tracked,
     free: Sequence[tuple[float, Place, Signal]],
     count: int,
@@ -251,9 +256,7 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
         for n, other in (best, best[::-1]):
             beside = linear.beside(other, couples[best][1])
             free = ranked(beside, [c for c in part if c[0] == Place(n)])
-            single = [
-                f for f in _varied(_terms(case, rig, beside, free, EACH)) if len(f.term.form.sizes) == 1
-            ]
+            single = [f for f in _varied(_terms(case, beside, free, EACH)) if len(f.term.form.sizes) == 1]
             each.append(single[:EACH])
         both = [p for p in itertools.product(*each) if not new or _reads([f.term for f in p], new)]
         out += _couples([_couple(linear, a, b, base) for a, b in both])
@@ -263,8 +266,7 @@ def propose_pairs(case: Case, parent: Fitted, limits: Thresholds) -> list[tuple[
 def _couple(linear: Tracked, a: Found, b: Found, base: tuple[float, Thresholds]) -> tuple[Proposal, Proposal]:
     """Return two laws at two places, each with the promise of both together."""
     x = np.concatenate([linear.columns(f.place, linear.along(f.term.values)) for f in (a, b)], axis=1)
-    promise, sizes = predicted(linear, x)
-    promise -= cost_of(linear, len(sizes) + sum(len(f.term.form.shapes) for f in (a, b)))
+    promise, sizes = predicted(linear, x, sum(len(f.term.form.shapes) for f in (a, b)))
     first, second = (
         Proposal(f.place, (f.term,), (float(q),), promise, *base) for f, q in zip((a, b), sizes, strict=True)
     )
@@ -361,9 +363,8 @@ def _varied(pool: Sequence[Found]) -> list[Found]:
 def _proposal(
     linear: Tracked, place: Place, law: tuple[Term, ...], x: np.ndarray, base: tuple[float, Thresholds]
 ) -> Proposal:
-    promise, c = predicted(linear, x)
-    p = Proposal(place, law, tuple(map(float, c)), promise, *base)
-    return dataclasses.replace(p, promise=promise - cost_of(linear, len(c) + p.shapes))
+    promise, c = predicted(linear, x, sum(len(t.form.shapes) for t in law))
+    return Proposal(place, law, tuple(map(float, c)), promise, *base)
 
 
 def _sums(

@@ -73,19 +73,14 @@ def refitted_law(
 def law_candidate(rig: Rig, p: Proposal) -> Candidate:
     """Return a law as an effect at its place."""
     effect = law_effect(p.terms, p.place, law_unit(rig.plant, p.place))
+    symbols = {str(of_plant(name(n)).value): name(n) for n in p.reads}
     if p.place.part == "reading":
         read = rig.physics.outputs[p.place.target]
         place = catalogue_places.Place(read.name, {"y": read.sensed or read.value}, output=read.name)
-        return Candidate(effect, place, rig, symbols=_marked(p))
+        return Candidate(effect, place, rig, symbols=symbols)
     ends = {"target": p.place.target, **({"source": p.place.source} if p.place.source else {})}
     ends |= {f"other{k}": n for k, (n, _) in enumerate(p.place.shares, 1)}
-    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig, symbols=_marked(p))
-
-
-def _marked(p: Proposal) -> dict[str, ex.Expr]:
-    """Return the plant's names by the names that a law reads."""
-    read = [s.value for t in p.terms for s in t.signals] + [share for _, share in p.place.shares]
-    return {str(of_plant(name(n)).value): name(n) for e in read for n in ex.names(e)}
+    return Candidate(effect, catalogue_places.Place(p.place.where, {}, ends), rig, symbols=symbols)
 
 
 def _bounded(c: Candidate, ranges: Mapping[str, tuple[float, float]]) -> Effect:

@@ -246,15 +246,15 @@ def _follows(column: str, p: Plant, runs: Sequence[Values]) -> bool:
 def _beside(rig: Rig, n: str) -> list[str]:
     """Return the inputs from which the distance of a node may drive a flow: its unit, in no flow of it.
 
-    For a body, the recorded temperatures to which it gives heat: the ambient, and those of its flows."""
+    For a body, the recorded temperatures: the ambient, those of its flows, and others that move."""
     rates = [ex.names(f.rate) for f in rig.physics.flows.values() if n in (f.source, f.target)]
     if n not in rig.temperatures:
         unit, inputs = rig.physics.nodes[n].unit, rig.physics.inputs
         others = rig.moving_inputs - set().union(*rates)
         return sorted(i for i in others if unit and inputs[i].unit == unit)
     exchanged = {i for read in rates if n in read for i in read & {*rig.heat_inputs}}
-    moving = {i for i in rig.heat_inputs if i in rig.moving_inputs}
-    return sorted(({rig.air} if rig.air else set()) | exchanged | moving, key=lambda i: (i != rig.air, i))
+    moving = rig.moving_inputs & {*rig.heat_inputs}
+    return sorted(moving | exchanged | ({rig.air} if rig.air else set()), key=lambda i: (i != rig.air, i))
 
 
 def _far(p: Plant, place: Place) -> set[str]:

@@ -23,7 +23,6 @@ from scipy.sparse import csr_matrix
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted, as_refitted
 from thermoctl.diagnosis.evidence.noise import Around
-from thermoctl.diagnosis.evidence.posterior import FAR
 from thermoctl.diagnosis.evidence.where import SHARES, typical_flow
 from thermoctl.diagnosis.hypothesis.places import flow_unit
 from thermoctl.diagnosis.hypothesis.rig import TEMPERATURE
@@ -32,7 +31,7 @@ from thermoctl.diagnosis.search.metric import Absorbed, Metric, Plain, Pushed
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
 from thermoctl.plant.fitting.refit import Fit
-from thermoctl.plant.fitting.residuals import Problem
+from thermoctl.plant.fitting.residuals import FAR, Problem
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
 

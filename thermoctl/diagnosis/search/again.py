@@ -15,8 +15,7 @@ import numpy as np
 from thermoctl.diagnosis.search.gains import Column, Direction, scores
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.overlay import Trajectory
-from thermoctl.diagnosis.search.screen import Group, projected
-from thermoctl.diagnosis.search.screen import chunks as chunks  # law/propose.py, too, has it from here
+from thermoctl.diagnosis.search.screen import Group, chunks, projected
 from thermoctl.diagnosis.search.sketch import foremost_groups
 
 # None of these numbers chooses a hypothesis: directions that are kept are screened exactly.
