@@ -279,7 +279,7 @@ walkthrough:                       # a new user's walk: a clean clone, every com
 
 .PHONY: test-scale
 test-scale: develop                # a Dask scheduler and workers started by hand, one killed; diagnose over a folder of rigs
-	$(BIN)/python -m pytest -m slow tests/proof/test_proof.py tests/diagnose/test_workers.py
+	$(BIN)/python -m pytest -m slow tests/proof/test_proof.py
 
 .PHONY: mutants
 mutants: develop                   # protection and arming: every branch covered, every mutant of the source caught or explained

@@ -1,4 +1,15 @@
-"""Plant files that several tests use."""
+"""Plant files, and one rig with recordings, that several tests use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from thermoctl.plant import load
+from thermoctl.plant.language import Plant
+from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.recording.table import Table
 
 TWO_BLOCKS = """\
 format: thermoctl-plant/1
@@ -165,3 +176,19 @@ flows:
 outputs:
   T: {value: one, unit: degC, noise: 0.05}
 """
+
+RADIATED = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
+
+
+def radiating(folder: Path, rows: int = 400, recordings: int = 2) -> tuple[Plant, list[Table]]:
+    """Return the plant of one block, and recordings of it with radiation."""
+    path = folder / "plant.yaml"
+    path.write_text(ONE_BLOCK.replace("flows:\n", f"flows:\n  concealed: {RADIATED}\n"))
+    model, t, tables = compile_plant(load(path)), np.arange(float(rows)), []
+    for k in range(recordings):
+        heat = 12.0 * np.random.default_rng(k).integers(0, 2, 8)[(8 * t // rows).astype(int)]
+        tables.append(
+            model.measure(Table(f"run_{k}", f"run_{k}", t, {"heat": heat, "air": 20 + 0 * t}), seed=k)
+        )
+    path.write_text(ONE_BLOCK)
+    return load(path), tables

@@ -11,14 +11,13 @@ one row in a hundred. Every diagnosis is a process of its own: CPU time (with th
 `bodies`: blocks of which every third one is measured and every sixth one heated. In a chain a middle one, not heated,
 has a heat source that the plant lacks. In a network, whose blocks are linked with near ones as in a CAD model, a link is missing.
 `recordings`: the actuator of twelve bodies, 30 000 rows a recording, with a missing link of two standard deviations in
-one of them. On one core each task of a recording is timed, and the time on more workers is computed from these.
+one of them, on one core and on two.
 `weak`: four blocks, with a missing link of two standard deviations in one recording of 1 200 rows.
 """
 
 from __future__ import annotations
 
 import argparse
-import heapq
 import json
 import os
 import subprocess
@@ -38,30 +37,16 @@ from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
 BODY = """
-import json, os, resource, sys, time
+import json, resource, sys
 try:
     from thermoctl.diagnosis.run import diagnose_files
-    from thermoctl.plant.fitting import residuals
 except ModuleNotFoundError:  # the folders of a372a6a and older
     from thermoctl.diagnose.run import diagnose_files
-    from thermoctl.plant import cores as residuals
-calls, side_by_side = [], residuals.each
-def timed(f, items, numbers):  # on one core these run one after the other
-    calls.append([])
-    def one(x):
-        started = time.thread_time()
-        try:
-            return f(x)
-        finally:
-            calls[-1].append(round(time.thread_time() - started, 4))
-    return side_by_side(one, items, numbers)
-if len(os.sched_getaffinity(0)) == 1:
-    residuals.each = timed
 found = diagnose_files(sys.argv[1], sys.argv[3:], sys.argv[2])
 used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
 print(json.dumps({"verdict": found["verdict"], "found": [f"{f['effect']} at {f['where']}" for f in found["findings"]],
     "probability": [round(f["probability"], 3) for f in found["findings"]],
-    "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"], "tasks": calls}))
+    "cpu_s": sum(u.ru_utime + u.ru_stime for u in used), "MiB": used[0].ru_maxrss / 1024, "notes": found["notes"]}))
 """
 LIMIT_S = 1800
 SIGMAS = 2.0  # of `weak` and `recordings`: size of the effect in one recording, in standard deviations
@@ -309,28 +294,6 @@ def recordings(numbers: list[int], workers: list[int], before: Path | None) -> N
                     f"{'':28} {found.get('wall_s', float('nan')):.1f} s; {SIGMAS * np.sqrt(n):.1f} sd: {named}",
                     flush=True,
                 )
-                if found.get("tasks"):
-                    simulate_workers(float(found["cpu_s"]), found["tasks"])  # type: ignore[arg-type]
-
-
-def makespan(tasks: Sequence[float], workers: int) -> float:
-    """Return the seconds that tasks take on workers, each taken in order by the first that is free."""
-    free = [0.0] * workers
-    for seconds in tasks:
-        heapq.heapreplace(free, free[0] + seconds)
-    return max(free)
-
-
-def simulate_workers(cpu_s: float, calls: Sequence[Sequence[float]]) -> None:
-    """Print the time on 1, 2, 4 and 16 workers: the part of one process, and the longest worker of each call.
-
-    Transfers between machines are left out."""
-    serial = cpu_s - sum(map(sum, calls))
-    print(
-        f"{'':28} {serial:.1f} s in one process, {sum(map(sum, calls)):.1f} s in {sum(map(len, calls))} tasks of a recording"
-    )
-    times = [serial + sum(makespan(c, w) for c in calls) for w in (1, 2, 4, 16)]
-    print(f"{'':28} 1, 2, 4, 16 workers: " + ", ".join(f"{t:.0f}" for t in times) + " s")
 
 
 def weak(numbers: list[int], before: Path | None) -> None:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.diagnose.test_workers import rig
+from tests.plants import radiating
 from thermoctl.diagnosis.commands import on_interrupt
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.data.progress import Pace
@@ -101,7 +101,7 @@ def foreground():
 
 def test_a_stopped_diagnosis_leaves_the_result_so_far(tmp_path, foreground):
     """Radiation is concealed; Ctrl-C comes during the second and third refit, which run side by side."""
-    plant, tables = rig(tmp_path, recordings=1)
+    plant, tables = radiating(tmp_path, recordings=1)
     with on_interrupt() as stopped:
 
         def progress(text: str) -> None:
@@ -133,7 +133,7 @@ def test_a_background_job_that_ignores_interrupts_goes_on(foreground):
 
 def test_a_result_is_truncated_only_where_a_refit_was_left_out(tmp_path):
     """The last refit allowed that ended a search told of hidden effects; the refits of laws hid one that was left out."""
-    plant, tables = rig(tmp_path, recordings=1)
+    plant, tables = radiating(tmp_path, recordings=1)
     entries, single = {"radiation": catalogue()["radiation"]}, replace(limits(), effects=1)
     needed = sought(plant, tables, entries, single, ()).case.budget.fits_done
     for fits in (needed, needed - 1):

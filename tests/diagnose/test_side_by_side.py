@@ -8,8 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from tests.diagnose.test_workers import rig
-from tests.plants import ONE_BLOCK
+from tests.plants import ONE_BLOCK, radiating
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.diagnosis.search import refits
 from thermoctl.plant import loads
@@ -19,7 +18,7 @@ from thermoctl.recording.table import Table
 
 
 def test_one_core_and_two_write_the_same_bytes(tmp_path, monkeypatch):
-    plant, tables = rig(tmp_path, recordings=1)
+    plant, tables = radiating(tmp_path, recordings=1)
     written, threads = [], []
     for n in (1, 2):
         monkeypatch.setattr(cores, "_cores", lambda n=n: n)

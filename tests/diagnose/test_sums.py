@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from tests.diagnose.test_workers import rig
+from tests.plants import radiating
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.evidence.fit import as_refitted, fitted, with_residuals
 from thermoctl.diagnosis.evidence.posterior import Posterior
@@ -19,7 +19,7 @@ from thermoctl.plant.fitting import residuals
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory):
-    plant, tables = rig(tmp_path_factory.mktemp("rig"), recordings=3)
+    plant, tables = radiating(tmp_path_factory.mktemp("rig"), recordings=3)
     return case(plant, tables, {}, Budget(9))
 
 
@@ -62,7 +62,7 @@ def test_sensitivities_that_are_not_kept_give_the_same_sums_and_result(known, mo
 
 
 def test_a_diagnosis_that_keeps_no_sensitivities_has_the_same_findings(tmp_path, monkeypatch):
-    plant, tables = rig(tmp_path, recordings=3)
+    plant, tables = radiating(tmp_path, recordings=3)
     kept = diagnose(plant, tables, tmp_path / "kept")
     monkeypatch.setattr(residuals, "KEPT", 0)
     forgot = diagnose(plant, tables, tmp_path / "forgot")

@@ -103,7 +103,7 @@ TABLE: Table = {
             option(
                 "--scheduler",
                 "ADDRESS",
-                "a Dask scheduler (tcp://...): its workers compute by recording; with folders by rig, from the same files",
+                "with folders: a Dask scheduler (tcp://...) whose workers see the same files",
             ),
             EFFECTS,
             option(

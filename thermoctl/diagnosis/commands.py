@@ -26,7 +26,6 @@ from thermoctl.diagnosis.law.result import save_effect
 from thermoctl.diagnosis.report import figures
 from thermoctl.diagnosis.report.words import sentences, what_next
 from thermoctl.diagnosis.show import read
-from thermoctl.diagnosis.workers import cluster
 from thermoctl.files.kept import reading
 from thermoctl.files.yamlfile import InputError
 from thermoctl.interrupt import Interrupted
@@ -138,11 +137,7 @@ def _run(
     args: argparse.Namespace, plant: Plant, tables: Sequence[Recording], held_out: Sequence[Recording]
 ) -> dict[str, Any]:
     """Diagnose with progress, Ctrl-C and the options of the command line."""
-    with (
-        contextlib.nullcontext() if args.quiet else StageReporter() as progress,
-        on_interrupt() as stopped,
-        cluster(args.scheduler),
-    ):
+    with contextlib.nullcontext() if args.quiet else StageReporter() as progress, on_interrupt() as stopped:
         return run.diagnose(
             plant,
             tables,

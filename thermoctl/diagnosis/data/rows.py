@@ -38,7 +38,7 @@ from scipy.fft import dct
 from scipy.special import chdtri
 
 from thermoctl.diagnosis.data.coordinates import bands
-from thermoctl.plant.fitting.cores import each_of
+from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.fitting.whitening import Noise, default_noise
@@ -115,7 +115,7 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
         chance = CHANCE / (len(tables) * len(model.outputs))
         point = [(*start, coarse, chance) for start in zip(coarse_fit.values, coarse_fit.dx0, strict=True)]
         numbers = before * len(model.states) * len(model.unknowns)
-        block = min(each_of(_block, [(model, t) for t in tables], point, numbers))
+        block = min(each(lambda r: _block(model, tables[r], *point[r]), range(len(tables)), numbers))
     except SimulationError:
         return kept
     if block == 1:
@@ -124,11 +124,13 @@ def reduced(plant: Plant, tables: Sequence[Table]) -> Reduced:
     return Reduced(out, block, before, coarse_fit.z)
 
 
-def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float) -> int:
+def _block(
+    model: Model, table: Table, values: np.ndarray, dx0: np.ndarray, coarse: int, chance: float
+) -> int:
     """Return the largest block, at most `coarse`, that a recording allows.
 
     `chance`: the probability that an output's white noise fails a test."""
-    model, d = of[0], of[0].excitation(of[1])
+    d = model.excitation(table)
     problem = Problem(model, [d], default_noise(model.plant, [d]))
     run = model.run(d, values, dx0, sensitivities=True, states=False)
     used, unknowns, slope = problem.slopes(0, values)
@@ -144,7 +146,7 @@ def _block(of: tuple[Model, Table], values: np.ndarray, dx0: np.ndarray, coarse:
 
     def enough(b: int) -> bool:
         """Return whether means of b rows keep the information on each unknown."""
-        if not _allowed(d, b) or _bent(of[0], of[1], b, (values, dx0), run.y) > BENT:
+        if not _allowed(d, b) or _bent(model, table, b, (values, dx0), run.y) > BENT:
             return False
         return bool((_information(columns, d, _starts(d, b), b, prior) >= whole / WIDER**2).all())
 

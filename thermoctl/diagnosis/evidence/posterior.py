@@ -88,16 +88,6 @@ class Sums:
     by_band: list[np.ndarray]
 
 
-def _slopes(
-    problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return a recording's free-run errors, its unknowns (k,) and its channels' slopes (rows, k)."""
-    d, buffers = problem.excitations[r], problem.buffers
-    run = problem.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
-    used, unknowns, slope = problem.slopes(r, values)
-    return d.y - run.y, unknowns, [_slope_rows(c, run.sensitivities, used, slope) for c in channels]
-
-
 def _slope_rows(c: Channel, dy: np.ndarray, used: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """Return a channel's slopes (rows, k) by its unknowns, from those of all outputs (N, outputs, q)."""
     own = dy[:, c.output]
@@ -129,24 +119,6 @@ def _sums(
             starts = np.cumsum(c.count) - c.count
             by_band.append(np.add.reduceat(jac * row[:, None], starts, axis=0))
     return Sums(unknowns, gradient, matrix, by_band)
-
-
-def _simulated_sums(
-    problem: Problem,
-    r: int,
-    values: np.ndarray,
-    dx0: np.ndarray,
-    channels: Sequence[Channel],
-    rows: Sequence[np.ndarray],
-    inverse: Sequence[np.ndarray],
-    bands: bool,
-) -> Sums:
-    """Return a recording's sums. Its slopes are computed and not kept."""
-    run = problem.model.run(problem.excitations[r], values, dx0, sensitivities=True, states=False)
-    used, unknowns, slope = problem.slopes(r, values)
-    dy = run.sensitivities  # copied one channel at a time: a recording has megabytes
-    slopes = (_slope_rows(c, dy, used, slope) for c in channels)
-    return _sums(channels, unknowns, slopes, rows, inverse, bands)
 
 
 class Posterior:
@@ -193,7 +165,7 @@ class Posterior:
 
     def errors(self, z: np.ndarray) -> list[np.ndarray]:
         """Return the free-run errors at z (N, outputs) by recording. Raises SimulationError."""
-        return self._checked(self.problem.each(Problem.errors, self.problem.unpack(z), lambda r: (), 1))
+        return self._checked(self.problem.each(self.problem.errors, self.problem.unpack(z), 1))
 
     def _checked(self, errors: list[np.ndarray]) -> list[np.ndarray]:
         if not all((abs(e[np.isfinite(d.y)]) < HUGE).all() for e, d in zip(errors, self.drives, strict=True)):
@@ -216,10 +188,20 @@ class Posterior:
         One run for both costs less than two. Raises SimulationError."""
         if not self.problem.keeps:
             return self.errors(z)
-        parts = self.problem.each(_slopes, self.problem.unpack(z), lambda r: (self.channels[r],), 2)
+        parts = self.problem.each(self._slopes, self.problem.unpack(z), 2)
         errors = self._checked([e for e, _, _ in parts])
         self.kept = z.copy(), [(unknowns, slopes) for _, unknowns, slopes in parts]
         return errors
+
+    def _slopes(
+        self, r: int, values: np.ndarray, dx0: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Return a recording's free-run errors, its unknowns (k,) and its channels' slopes (rows, k)."""
+        d, buffers = self.drives[r], self.problem.buffers
+        run = self.model.run(d, values, dx0, sensitivities=True, buffers=buffers, states=False)
+        used, unknowns, slope = self.problem.slopes(r, values)
+        rows = [_slope_rows(c, run.sensitivities, used, slope) for c in self.channels[r]]
+        return d.y - run.y, unknowns, rows
 
     def sums(
         self, z: np.ndarray, rows: Sequence[np.ndarray], inverse: Sequence[np.ndarray], bands: bool = False
@@ -234,8 +216,16 @@ class Posterior:
             data.append((rows[begin:end], inverse[begin:end]))
             begin = end
         if not self.problem.keeps:
-            point = self.problem.unpack(z)
-            return self.problem.each(_simulated_sums, point, lambda r: (self.channels[r], *data[r], bands), 2)
+
+            def simulated(r: int, values: np.ndarray, dx0: np.ndarray) -> Sums:
+                """Return the sums of a recording whose slopes are not kept."""
+                run = self.model.run(self.drives[r], values, dx0, sensitivities=True, states=False)
+                used, unknowns, slope = self.problem.slopes(r, values)
+                dy = run.sensitivities  # copied one channel at a time: a recording has megabytes
+                slopes = (_slope_rows(c, dy, used, slope) for c in self.channels[r])
+                return _sums(self.channels[r], unknowns, slopes, *data[r], bands)
+
+            return self.problem.each(simulated, self.problem.unpack(z), 2)
         if self.kept is None or not np.array_equal(self.kept[0], z):
             self.errors_and_slopes(z)
         assert self.kept is not None

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, transforms
+from thermoctl.diagnosis.data.coordinates import Coordinates, transforms
 from thermoctl.diagnosis.data.grids import grid
 from thermoctl.diagnosis.evidence.noise import Around, Averaged
 from thermoctl.diagnosis.evidence.where import signals
@@ -78,7 +78,7 @@ class Plain:
         self.grids = [grid(self.coordinates, ks, g) for ks, g in zip(measured, case.grids, strict=True)]
         self.channels = [self.coordinates.of_recording(r) for r in range(len(self.drives))]
         self.point = self.fit.values, self.fit.dx0
-        parts = self.problem.each(_sensitive, self.point, lambda r: (self.channels[r],), 2)
+        parts = self.problem.each(self._sensitive, self.point, 2)
         self.runs = [run for run, _, _ in parts]
         self.residual = np.concatenate([residual for _, residual, _ in parts])
         # By recording (rows, k), with respect to `unknowns`.
@@ -88,38 +88,15 @@ class Plain:
         """Return the unknowns of recording r."""
         return self.problem.columns[r, self.problem.columns[r] >= 0]
 
-
-def _sensitive(
-    problem: Problem, r: int, values: np.ndarray, dx0: np.ndarray, channels: Sequence[Channel]
-) -> tuple[Simulation, np.ndarray, np.ndarray]:
-    """Return a recording's run, and the DCT rows of its residual and of its sensitivities (rows, k)."""
-    d = problem.excitations[r]
-    run = problem.model.run(d, values, dx0, sensitivities=True, states=False)
-    used, _, slope = problem.slopes(r, values)
-    rows = transforms(channels, run.sensitivities[:, :, used]) * slope
-    return Simulation(run.t, run.x, run.y), transforms(channels, d.y - run.y), rows
-
-
-def _response(
-    problem: Problem,
-    r: int,
-    values: np.ndarray,
-    dx0: np.ndarray,
-    channels: Sequence[Channel],
-    pushed: Pushed,
-    count: int,
-) -> np.ndarray:
-    """Return the rows of a recording's responses (rows, count) to first-order changes."""
-    d, point = problem.excitations[r], (values, dx0)
-    model, buffers = problem.model, problem.buffers
-    dy = (
-        model.respond(d, *point, pushed.forces, pushed.q, count, buffers=buffers)
-        if pushed.forces
-        else np.zeros((*d.y.shape, count))
-    )
-    for (j, c), delta in pushed.read.items():
-        dy[:, j, c] += delta
-    return transforms(channels, dy)
+    def _sensitive(
+        self, r: int, values: np.ndarray, dx0: np.ndarray
+    ) -> tuple[Simulation, np.ndarray, np.ndarray]:
+        """Return a recording's run, and the DCT rows of its residual and of its sensitivities (rows, k)."""
+        d, channels = self.drives[r], self.channels[r]
+        run = self.model.run(d, values, dx0, sensitivities=True, states=False)
+        used, _, slope = self.problem.slopes(r, values)
+        rows = transforms(channels, run.sensitivities[:, :, used]) * slope
+        return Simulation(run.t, run.x, run.y), transforms(channels, d.y - run.y), rows
 
 
 class Metric:
@@ -190,10 +167,21 @@ class Metric:
 
         `pushed`: returns the first-order changes in recording r. `count`: number of columns."""
         plain = self.plain
+
+        def response(r: int, values: np.ndarray, dx0: np.ndarray) -> np.ndarray:
+            """Return the rows of one recording."""
+            d, changes, buffers = self.drives[r], pushed(r), plain.problem.buffers
+            dy = (
+                self.model.respond(d, values, dx0, changes.forces, changes.q, count, buffers=buffers)
+                if changes.forces
+                else np.zeros((*d.y.shape, count))
+            )
+            for (j, c), delta in changes.read.items():
+                dy[:, j, c] += delta
+            return transforms(plain.channels[r], dy)
+
         size = 1 + count // (1 + len(self.model.unknowns))
-        return np.concatenate(
-            plain.problem.each(_response, plain.point, lambda r: (plain.channels[r], pushed(r), count), size)
-        )
+        return np.concatenate(plain.problem.each(response, plain.point, size))
 
     def spread(self, r: int, w: np.ndarray) -> np.ndarray:
         """Apply the transpose of `transforms` to rows w (rows, k): return (N, outputs, k) of recording r."""

@@ -1,18 +1,17 @@
-"""Recordings or refits side by side, on all cores; recordings also on the workers of a cluster.
+"""Recordings or refits side by side, on all cores.
 
 A plant's machine code and numpy's loops run outside Python's lock. Results come in the order of the
-items and are summed in this order. So they do not depend on the number of cores or workers."""
+items and are summed in this order. So they do not depend on the number of cores."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cache
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 LEAST = (
     200_000  # numbers that a run computes, about a millisecond: less is not worth the way to another thread
@@ -86,41 +85,3 @@ def give_back() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim:
         trim(0)
-
-
-class Workers(Protocol):
-    """Other processes that compute for this one."""
-
-    def hold(self, thing: Any) -> Any:
-        """Return a handle of an object that workers keep, so that it is sent once."""
-
-    def each(self, f: Callable[..., R], held: Sequence[Any], arguments: Iterable[tuple[Any, ...]]) -> list[R]:
-        """Return f(object, *arguments) of each handle."""
-
-
-_elsewhere: list[Workers] = []
-
-
-@contextmanager
-def elsewhere(workers: Workers) -> Iterator[None]:
-    """Compute on these workers what is computed by recording."""
-    _elsewhere.append(workers)
-    try:
-        yield
-    finally:
-        _elsewhere.remove(workers)
-
-
-def workers() -> Workers | None:
-    """Return the workers to compute on; None: this process."""
-    return _elsewhere[-1] if _elsewhere else None
-
-
-def each_of(
-    f: Callable[..., R], things: Sequence[Any], arguments: Sequence[tuple[Any, ...]], numbers: int
-) -> list[R]:
-    """Return f(thing, *arguments) of each thing, here side by side (`each`) or by workers."""
-    far = workers() if len(things) > 1 else None
-    if far is not None:
-        return far.each(f, [far.hold(x) for x in things], arguments)
-    return each(lambda k: f(things[k], *arguments[k]), range(len(things)), numbers)

@@ -16,13 +16,14 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
-from thermoctl.plant.fitting.cores import each, workers
+from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.fitting.whitening import Noise, Whitening
 from thermoctl.plant.language import Parameter
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError
@@ -137,7 +138,6 @@ class Problem:
         self.numbers = sum(len(d.t) for d in excitations) * len(model.states) * (len(model.unknowns) + 1)
         slopes = sum(d.y.size for d in excitations) * len(model.unknowns)
         self.keeps = slopes <= KEPT  # may sensitivities be kept?
-        self.held: list[Any] = []  # handles of `alone`, for workers
         self.samples = sum(len(w.index) for outputs in self.whitening for w in outputs)
         if self.samples == 0:
             raise InputError("no recording has a column that an output of the plant reads; nothing to fit")
@@ -200,7 +200,6 @@ class Problem:
         """Return the same problem with another noise of output j."""
         other = copy.copy(self)
         other.noise = (*self.noise[:j], n, *self.noise[j + 1 :])
-        other.held = []
         other.whitening = [
             [Whitening.of(d, j, n) if k == j else w for k, w in enumerate(outputs)]
             for d, outputs in zip(self.excitations, self.whitening, strict=True)
@@ -216,34 +215,14 @@ class Problem:
         values[:, self.at] = np.where(known[:, :first], own[:, :first], values[:, self.at])
         return values, np.where(known[:, first:], own[:, first:], 0.0)
 
-    def alone(self, r: int) -> Problem:
-        """Return the problem of one recording, with the same numbers of the unknowns; it has no priors."""
-        other = copy.copy(self)
-        other.excitations, other.whitening = [self.excitations[r]], [self.whitening[r]]
-        other.columns, other.fixed, other.priors = self.columns[r : r + 1], self.fixed[r : r + 1], ()
-        other.buffers, other.kept_buffers, other.held = {}, {}, []
-        return other
-
     def each(
-        self,
-        f: Callable[..., R],
-        point: tuple[np.ndarray, np.ndarray],
-        arguments: Callable[[int], tuple[Any, ...]],
-        size: int,
+        self, f: Callable[[int, np.ndarray, np.ndarray], R], point: tuple[np.ndarray, np.ndarray], size: int
     ) -> list[R]:
-        """Return f(problem, r, values[r], dx0[r], *arguments(r)) of each recording r, here or by workers.
+        """Return f(r, values[r], dx0[r]) of each recording r.
 
-        `point`: values and dx0. `size`: cost in runs without sensitivities. A worker has the problem of a
-        recording `alone`, r = 0."""
+        `point`: values and dx0. `size`: cost in runs without sensitivities."""
         values, dx0 = point
-        recordings = range(len(self.excitations))
-        far = workers() if len(recordings) > 1 else None
-        if far is None:
-            return each(
-                lambda r: f(self, r, values[r], dx0[r], *arguments(r)), recordings, size * self.numbers
-            )
-        self.held = self.held or [far.hold(self.alone(r)) for r in recordings]
-        return far.each(f, self.held, ((0, values[r], dx0[r], *arguments(r)) for r in recordings))
+        return each(lambda r: f(r, values[r], dx0[r]), range(len(self.excitations)), size * self.numbers)
 
     def set_outlier_limits(self, residuals: Sequence[np.ndarray]) -> bool:
         """Set Huber's limit of each output from its residuals; True if one changed by more than a half.
@@ -295,9 +274,9 @@ class Problem:
         evaluation with derivatives overwrites them, unless `self.keep` is called."""
         cost, gradient, matrix = 0.0, np.zeros(len(z)), np.zeros((len(z), len(z)))
         keeping = self.keeps and keep is not None
-        key = (jacobian, keeping, self.huber)
         residuals = []
-        for r, part in enumerate(self.each(Problem._part, self.unpack(z), lambda r: key, jacobian + 1)):
+        parts = self.each(partial(self._part, jacobian, keeping), self.unpack(z), jacobian + 1)
+        for r, part in enumerate(parts):
             cost += part.cost
             residuals.append(part.residual)
             if keep is not None:
@@ -311,9 +290,7 @@ class Problem:
         gradient = gradient + prior_gradient - weight * distance
         return Evaluation(cost, gradient, matrix + prior_matrix + np.diag(weight), residuals)
 
-    def _part(
-        self, r: int, values: np.ndarray, dx0: np.ndarray, jacobian: bool, keeping: bool, huber: np.ndarray
-    ) -> _Part:
+    def _part(self, jacobian: bool, keeping: bool, r: int, values: np.ndarray, dx0: np.ndarray) -> _Part:
         """Return what one recording adds to an evaluation. Raises SimulationError."""
         d, buffers = self.excitations[r], self.buffers if self.keeps else {}
         run = self.model.run(d, values, dx0, sensitivities=jacobian, buffers=buffers, states=False)
@@ -326,7 +303,7 @@ class Problem:
             if not len(whitening.index):
                 continue
             w = whitening.whiten(e[:, j])
-            size, limit = np.abs(w), huber[j]
+            size, limit = np.abs(w), self.huber[j]
             cost += float(np.sum(np.where(size <= limit, w * w, 2 * limit * size - limit**2)))
             if run.dy is None:
                 continue
@@ -364,7 +341,7 @@ class Problem:
         """Return J' d2w/dh2 of the whitened residuals w(z + h step), by one more simulation.
 
         Raises SimulationError."""
-        errors = self.each(Problem.errors, self.unpack(z + PROBE * step), lambda r: (), 1)
+        errors = self.each(self.errors, self.unpack(z + PROBE * step), 1)
         out = np.zeros(len(z))
         for rows in kept:
             r, j = rows.recording, rows.output
