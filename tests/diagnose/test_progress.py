@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import signal
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 
 from tests.plants import radiating
 from thermoctl.diagnosis.commands import on_interrupt
 from thermoctl.diagnosis.data.case import Budget
-from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.diagnose import sought
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.run import diagnose
-from thermoctl.diagnosis.search import beam as search
 from thermoctl.files import shipped
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load
@@ -35,50 +32,20 @@ def test_a_refit_is_reported_of_those_planned():
     assert [text.split("refit ")[1].split(" planned")[0] for text in said] == ["1 of 1", "2 of 3", "3 of 5"]
 
 
-# Seconds at which refits (r) and screenings (s) began, with refits planned by then: a network of 120 bodies, whose
-# third refit left no more than noise, under a profiler; the end of the search, and of the diagnosis.
-NETWORK = "r17/1 s21 r110/17 r123/17 r136/17 r145/17 r153/17 r163/17 r173/17 r186/17 r195/17 r212/17 r223/17 r233/17 "
-NETWORK += "r244/17 r259/17 r270/17 s294"
-END_S = 396.0
-
-
-def test_time_left_is_within_a_factor_of_two_from_the_second_minute_on():
-    """The plan of the search as it was then: one more screening, of the best hypothesis, which is the last."""
-    now, said = [0.0], list[tuple[float, str]]()
-    budget = Budget(80, lambda text: said.append((now[0], text)), pace=Pace(lambda: now[0]))
-    for number, event in enumerate(NETWORK.split()):
-        seconds, _, planned = event[1:].partition("/")
-        now[0] = float(seconds)
-        budget.later = 0 if number == 0 or event == "s294" else 1
-        if event[0] == "s":
-            budget.screen()
-        else:
-            budget.planned = int(planned)
-            budget.spend()
-    told = [(t, text.rpartition("about ")[2].split()) for t, text in said if "about" in text]
-    assert len(told) == len(NETWORK.split()) - 2  # none before the first screening is done
-    for t, (number, unit, _) in told:
-        left = float(number) * (60 if unit == "min" else 1)
-        assert 0.5 < left / (END_S - t) < 2, (t, left)
-
-
-def test_the_first_extension_expects_a_beam_after_it(monkeypatch):
-    """Six recordings of twelve bodies, close to the noise from the start: 0.3 to 0.5 of the true time was told."""
-    told: list[float] = []
-
-    class First(SimpleNamespace):
-        def extended(self, parent):
-            told.append(self.case.budget.later)
-            return False
-
-    null = SimpleNamespace(score=0.0, fitted=SimpleNamespace(hypothesis=SimpleNamespace(keys=frozenset())))
-    monkeypatch.setattr(search, "leaders", lambda tried, limits: tried)
-    monkeypatch.setattr(search, "only_noise", lambda case, fitted, limits: True)
-    limits = SimpleNamespace(effects=3, beam=4)
-    search.grow(
-        First(limits=limits, tried={1: null}, seen={}, case=SimpleNamespace(budget=Budget(9)), best=null)
-    )
-    assert told == [search.CLOSE * limits.beam]
+def test_progress_gives_the_time_of_the_planned_refits():
+    """Refits of 20 s, side by side in pairs; the screening of 90 s before them is no measure of a refit."""
+    said: list[str] = []
+    times = iter([0.0, 110.0, 110.0, 150.0, 150.0, 190.0])
+    budget = Budget(80, said.append, clock=lambda: next(times))
+    budget.spend()
+    budget.screen()
+    budget.planned = 17
+    for _ in range(5):
+        budget.spend()
+    assert [text.partition(", ")[2] for text in said] == [""] * 5 + [
+        "about 3 min for these",
+        "about 4 min for these",
+    ]
 
 
 @pytest.mark.parametrize("inside", ["", "result"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +17,6 @@ from thermoctl.checks.model import SIGMAS, start_errors
 from thermoctl.diagnosis.data.coordinates import FEWEST, Coordinates
 from thermoctl.diagnosis.data.grids import Grid, Reading, grid
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
-from thermoctl.diagnosis.data.progress import Pace
 from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced, switches
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
@@ -38,7 +38,8 @@ FAST = 0.01  # share of an output's changes that may be jumps
 CHANCE = 0.05  # chance of so many outliers right after switches, below which the plant answers there
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from there
-LATER = 2.5  # refits that follow a later screening: mean of 26 diagnoses of real and shared rigs
+# Progress gives the time of the planned refits if it is not short, from this number of refits of a step on.
+SHORT_S, KNOWN = 30.0, 4
 
 
 Outliers = tuple[tuple[str, str, tuple[float, ...]], ...]  # recording, column, times in s
@@ -49,9 +50,9 @@ class Budget:
     """Largest number of refits, and the number done. It counts refits, not time: the same on every machine.
 
     - `planned`: number of refits after this step of the search; each step may plan more
-    - `later`: number of hypotheses that the search may still extend, for the time left that progress states
     - `stopped`: has a person asked for the result so far?
-    - `untried`: number of promising refits that were left out"""
+    - `untried`: number of promising refits that were left out
+    - `starts`: times of `clock`, in s, at which the refits of this step began"""
 
     fits: int
     progress: Callable[[str], None] = lambda text: None
@@ -59,8 +60,8 @@ class Budget:
     fits_done: int = 0
     planned: int = 1
     untried: int = 0
-    later: float = 0.0
-    pace: Pace = field(default_factory=Pace)
+    clock: Callable[[], float] = time.monotonic
+    starts: list[float] = field(default_factory=list)
     lock: Lock = field(default_factory=Lock)  # two refits may run in parallel
 
     @property
@@ -72,25 +73,26 @@ class Budget:
         """Count one refit, and report it."""
         give_back()
         with self.lock:
-            self.pace.enter("refit")
             self.fits_done += 1
+            self.starts.append(self.clock())
             planned = min(max(self.planned, self.fits_done), self.fits)
-            left = self._left(planned - self.fits_done + 1, 0)
             of = f" of {planned} planned so far (at most {self.fits})" if self.fits_done <= planned else ""
-            self.progress(f"searching: refit {self.fits_done}{of}{left}")
+            self.progress(f"searching: refit {self.fits_done}{of}{self._left(planned - self.fits_done + 1)}")
 
     def screen(self) -> None:
-        """Report that a hypothesis is screened for effects."""
+        """Report that a hypothesis is screened for effects: the next refits are another step."""
         give_back()
-        self.pace.enter("screening")
-        number = 1 + len(self.pace.spent.get("screening", ()))
-        self.progress(
-            f"searching: screening {number}, after refit {self.fits_done}{self._left(min(LATER, self.later), 1)}"
-        )
+        self.starts.clear()
+        self.progress(f"searching: screening after refit {self.fits_done}")
 
-    def _left(self, refits: float, screenings: float) -> str:
-        planned = min(refits + LATER * self.later, self.fits - self.fits_done + 1)
-        return self.pace.left_text({"refit": planned, "screening": screenings + self.later})
+    def _left(self, refits: int) -> str:
+        """Return the time of so many refits as the end of a sentence; '' where it is short or not known."""
+        if len(self.starts) < KNOWN:
+            return ""
+        left = refits * (self.starts[-1] - self.starts[0]) / (len(self.starts) - 1)
+        if left < SHORT_S:
+            return ""
+        return f", about {left / 60:.0f} min for these" if left > 90 else f", about {left:.0f} s for these"
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ SURPLUS = 5.0  # nats by which an effect of no size must lead, so that the other
 NEAR = 4.6
 # Nats below the best, from which a law is left out; for each effect allowed, also an earlier hypothesis.
 BEATEN = 10.0
-# Share of the hypotheses near the best that will be extended, for the time left that the progress states.
-CLOSE = 0.5
 
 
 @dataclass(frozen=True)
@@ -182,22 +180,17 @@ def started(case: Case, limits: Thresholds) -> Search:
 
 def grow(s: Search) -> None:
     """Extend the beam until none of its extensions is better."""
-    for number in range(s.limits.effects):
+    for _ in range(s.limits.effects):
         first, *others = leaders(list(s.tried.values()), s.limits)
         # one effect more may make such a hypothesis the better one
         fewer = [w for w in others if _number(w) < _number(first)]
-        if close := only_noise(s.case, first.fitted, s.limits):
+        if only_noise(s.case, first.fitted, s.limits):
             near = first.score - NEAR
             others = [w for w in others if w.score >= near or _number(w) < _number(first)]
-        rounds = s.limits.effects - number - 1
-        # beside the plant alone none is known
-        follows = s.limits.beam if len(s.tried) == 1 and rounds else 0
         known = first.fitted.hypothesis.keys in s.seen
         parents = [first, *others]
         while parents:
             parent, *parents = parents
-            left = CLOSE * (len(parents) + follows) if close else len(parents) + rounds * s.limits.beam
-            s.case.budget.later = left
             if not s.extended(parent) and parent is first and not known:
                 parents = fewer  # the best cannot be extended: no rival with more effects is needed
         if s.best.score <= first.score:
@@ -422,7 +415,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     out: list[Weighed] = []
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
-    queue, planned, ratio = shortlist(looked, where, limits, paired=misfit), case.budget.later, 1.0
+    queue, ratio = shortlist(looked, where, limits, paired=misfit), 1.0
     new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
     queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
@@ -442,8 +435,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
 
     for batch, left in batches(queue, wanted):
         leader = max((w.fitted for w in [*tried.values(), *out]), key=lambda f: f.log_likelihood)
-        untried = (left + len(batch)) / len(queue)
-        case.budget.later = min(planned, _expected(case, [*tried.values(), *out], leader, limits, untried))
         case.budget.planned = case.budget.fits_done + left + len(batch)
         for (added, gain), f in zip(batch, refitted(case, parent.fitted, looked, batch, leader), strict=True):
             gained = s.weighed(f).score - parent.score if f else -np.inf
@@ -456,18 +447,3 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 more = simpler(added, gain, looked, where, limits)
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     return out
-
-
-def _expected(
-    case: Case, tried: Sequence[Weighed], leader: Fitted, limits: Thresholds, untried: float
-) -> float:
-    """Estimate how many more hypotheses the search will extend, for the time left that the progress states.
-
-    `untried`: share of the shortlist."""
-    if not any(w.fitted.hypothesis.effects for w in tried):
-        # The search may end with the next hypothesis, or extend every beam.
-        return CLOSE * limits.beam * untried
-    if not only_noise(case, leader, limits):
-        return np.inf
-    scores = sorted((w.score for w in tried), reverse=True)[: limits.beam]
-    return CLOSE * sum(score >= scores[0] - NEAR for score in scores)
