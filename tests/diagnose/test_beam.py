@@ -37,7 +37,7 @@ class Known(Search):
 
     def __init__(self, extensions: dict[str, dict[str, float]]):
         budget = SimpleNamespace(spent=False, later=0.0)
-        super().__init__(SimpleNamespace(budget=budget), limits(), {})
+        super().__init__(SimpleNamespace(budget=budget, limits=limits()), {})
         self.known = {frozenset(k): v for k, v in extensions.items()}
         self.order: list[str] = []
         self.keep([weighed("", 0.0)])
@@ -58,7 +58,7 @@ class Known(Search):
 @pytest.fixture(autouse=True)
 def only_noise(monkeypatch):
     """Let every hypothesis with effects leave only noise."""
-    monkeypatch.setattr(beam, "only_noise", lambda case, f, limits: bool(f.hypothesis.effects))
+    monkeypatch.setattr(beam, "only_noise", lambda case, f: bool(f.hypothesis.effects))
 
 
 FIRST = {"a": 145.0, "b": 141.0, "xb": 197.0}  # x imitates a beside b: the pair was proposed as a pair
@@ -149,7 +149,7 @@ def test_a_search_that_is_stopped_knows_that_something_was_left_out(monkeypatch,
     monkeypatch.setattr(beam, "simplified", lambda s: [])
     monkeypatch.setattr(beam, "cleared", lambda s: [])
     monkeypatch.setattr(beam, "rebuilt", lambda s, rest, *a: weighed("".join(e.key[0] for e in rest), 50.0))
-    s = Search(SimpleNamespace(budget=Budget(99, stopped=lambda: len(order) >= after)), limits(), {})
+    s = Search(SimpleNamespace(budget=Budget(99, stopped=lambda: len(order) >= after), limits=limits()), {})
     s.keep([weighed("", 0.0)])
     grow(s)
     beam.swap(s)
@@ -190,7 +190,7 @@ def rubbed() -> Case:
 def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
     """Beside cogging, dry friction promised too little for a refit: a friction that contains it was named."""
     known = rubbed()
-    s = beam.started(known, limits())
+    s = beam.started(known)
     rig = known.rig(known.plant, known.drives(known.null.model))
     c = next(c for c in candidates(rig, known.catalogue) if c.key == (richer, "velocity"))
     plant = c.extend(sizes, {k: (-4.0 if k in "DH" else 0.0, 4.0) for k in sizes} | {"W": (1e-5, 0.1)})
@@ -205,7 +205,7 @@ def test_what_contains_dry_friction_is_compared_with_it(richer, sizes):
 def test_an_effect_that_is_nothing_is_not_ahead_of_a_worse_refit_of_the_others():
     """A free stage with friction and cogging: their refit had ended far off, and a third effect of no size was named."""
     known = rubbed()
-    s, plant, placed = beam.started(known, limits()), known.plant, ()
+    s, plant, placed = beam.started(known), known.plant, ()
     for key, values, ranges in (
         (("coulomb_friction", "velocity"), {"W": 1e-3, "F": 1.1}, {"W": (1e-5, 0.1), "F": (0.0, 4.0)}),
         (("constant_load", "velocity"), {"F": 0.01}, {"F": (-4.0, 4.0)}),

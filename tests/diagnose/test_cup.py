@@ -44,7 +44,7 @@ def test_an_effect_that_a_parameter_of_the_plant_may_replace_is_kept():
     plant, table = cooled("G * 0.17 * (1 + 0.09 * (water - 20)) * (water - room)", 2.0, 300)
     names = ("temperature_dependent_conductance", "variable_heat_capacity", "hidden_thermal_mass")
     entries = {n: e for n, e in catalogue().items() if n in names}
-    found = search(case(plant, [table], entries, Budget(80)), limits())
+    found = search(case(plant, [table], entries, Budget(80)))
     assert found.tried[0].fitted.hypothesis.keys == {("temperature_dependent_conductance", "loss")}
 
 

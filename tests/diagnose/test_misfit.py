@@ -61,13 +61,13 @@ def errors(seed: int, size: float, effect: str) -> tuple[float, float]:
     seen = {c: v for c, v in table.columns.items() if c != "draught"}
     plant, table = loads(read_as(ONE_BLOCK, effect)), dataclasses.replace(table, columns=seen)
     known = case(plant, [table], catalogue(), Budget(20))
-    s = beam.started(known, limits())
+    s = beam.started(known)
     rig = known.rig(known.plant, known.drives(known.null.model))
     c = next(c for c in candidates(rig, known.catalogue) if c.key[0] == effect)
     lag = Placed(c, {"TAU": c.own("TAU")})
     f = fitted(known, c.extend({"TAU": 5.0}, {"TAU": (0.5, 200.0)}), (lag,))
     s.keep([s.weighed(f)])
-    sd = deviations(f, energies(known, beam.searched(s), limits()), limits())
+    sd = deviations(f, energies(known, beam.searched(s)), limits())
     away = f.plant.parameters[lag.own["TAU"]].value - LAG_S
     return away / f.sd[lag.own["TAU"]], away / sd[lag.own["TAU"]]
 

@@ -65,7 +65,7 @@ def shared_by_two(belief, truth, inputs):
     entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in two}
     known = case(loads(belief), [table], entries, Budget(30))
     numbers = dataclasses.replace(limits(), effects=1)
-    one, other = (search(dataclasses.replace(known, catalogue={k: entries[k]}), numbers) for k in two)
+    one, other = (search(dataclasses.replace(known, catalogue={k: entries[k]}, limits=numbers)) for k in two)
     searched = dataclasses.replace(
         one, tried=(*one.tried, *(w for w in other.tried if w.fitted.hypothesis.keys))
     )

@@ -7,7 +7,6 @@ import numpy as np
 from tests.plants import FREE_CARRIAGE, ONE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.hypothesis.rig import Rig
-from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search import beam as search
 from thermoctl.diagnosis.search.observer import drifts, held, linear
 from thermoctl.plant import loads
@@ -52,7 +51,7 @@ def test_an_observer_holds_a_carriage_whose_friction_is_missing_and_is_no_place_
 
 def test_an_observer_that_fails_does_not_end_the_search(monkeypatch):
     plant, table = loads(FREE_CARRIAGE), _recorded()
-    s = search.started(case(plant, [table], {}, Budget(8)), limits())
+    s = search.started(case(plant, [table], {}, Budget(8)))
     tried = []
 
     def fails(of, followed):

@@ -42,9 +42,9 @@ def searched():
 def test_swapped_columns_are_told_from_physics(searched):
     plant, ((table, right), (swapped, wrong)) = searched
     assert not [f for f in checks(plant, [table]) if f.severe]
-    assert right.decision.verdict != "consistent" and relabelled(right, limits()) == []
+    assert right.decision.verdict != "consistent" and relabelled(right) == []
     assert wrong.decision.verdict == "explained", "physics that imitates the mistake"
-    (finding,) = relabelled(wrong, limits())
+    (finding,) = relabelled(wrong)
     assert (
         finding.severe and f"'{ONE}' and '{TWO}' are swapped" in finding.what and "convection" in finding.what
     )

@@ -26,7 +26,7 @@ from thermoctl.recording.table import Table
 def looked_at(plant: str, table: Table) -> tuple[Search, Screened]:
     """The search with the plant alone, and its screening."""
     known = case(loads(plant), [table], catalogue(), Budget(80))
-    search = started(known, limits())
+    search = started(known)
     return search, screened(known, search.best.fitted)
 
 

@@ -8,7 +8,6 @@ import pytest
 from tests.plants import TWO_BLOCKS
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
-from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import started
 from thermoctl.diagnosis.search.refits import refitted
 from thermoctl.diagnosis.search.screening import screened
@@ -28,7 +27,7 @@ def test_its_refit_starts_where_it_gains_what_the_screening_promised(seed):
     truth = loads(TWO_BLOCKS.replace("flows:\n", WALL))
     table = compile_plant(truth).measure(table, seed=seed)
     known = case(loads(TWO_BLOCKS), [table], catalogue(), Budget(80))
-    null = started(known, limits()).best
+    null = started(known).best
     looked = screened(known, null.fitted)
     key = ("second_ambient", "one")
     promise, found = next((p, d) for d, p in looked.promised if d.candidate.key == key)

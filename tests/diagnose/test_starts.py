@@ -38,7 +38,7 @@ def test_a_tank_that_spills_in_its_first_rows_only_has_no_wrong_start(tmp_path):
 
     Taken for an outlier, that reading was lost, and the rest named a sensor's gain with 0.998."""
     plant, table = spilled(tmp_path)
-    null = started(case(plant, [table], catalogue(), Budget(80)), limits()).best.fitted
+    null = started(case(plant, [table], catalogue(), Budget(80))).best.fitted
     assert abs(null.fit.dx0[0, 0]) > 4 * 0.05
     found = diagnose(plant, [table], catalogue(), limits())
     assert found.decision.verdict == "explained" and found.decision.named == (("overflow", "tank"),)
@@ -63,7 +63,7 @@ def test_a_slow_sensor_pays_no_more_for_its_start_than_a_delayed_one():
         columns = {"heat": heat, "air_temperature": np.full(1500, 21.0)}
         tables.append(truth.measure(Table("run", "run", t, columns), seed=1))
     known = case(loads(TWO_BLOCKS), tables, catalogue(), Budget(80))
-    null = started(known, limits()).best.fitted
+    null = started(known).best.fitted
     looked, paid = screened(known, null), {}
     for d, _ in looked.promised:
         if d.candidate.key in (("sensor_lag", "temperature_1"), ("sensor_delay", "temperature_1")):

@@ -879,7 +879,7 @@ def test_friction_that_grows_with_the_load_is_not_taken_for_dry_friction_that_le
     friction = next(
         w for w in d.searched.tried if w.fitted.hypothesis.keys == {("coulomb_friction", "velocity")}
     )
-    assert only_noise(d.case, friction.fitted, limits()) and d.decision.named == (("law", "velocity"),)
+    assert only_noise(d.case, friction.fitted) and d.decision.named == (("law", "velocity"),)
 
 
 def test_no_law_is_claimed_where_nothing_is_missing():

@@ -140,8 +140,7 @@ RULES: Mapping[str, Rule] = {
         {"evidence.levels.levels": _stated},
     ),
     "coloured": Rule(
-        "a certain remainder may be the coloured noise of a sensor",
-        {"diagnose.coloured": lambda case, f, limits: []},
+        "a certain remainder may be the coloured noise of a sensor", {"diagnose.coloured": lambda case, f: []}
     ),
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
@@ -221,9 +220,7 @@ RULES: Mapping[str, Rule] = {
         {"law.contest.pays": lambda case, f, limits: True},
         searches=True,
     ),
-    "laws": Rule(
-        "laws compete", {"diagnose.with_laws": lambda case, found, limits, say: found}, searches=True
-    ),
+    "laws": Rule("laws compete", {"diagnose.with_laws": lambda case, found: found}, searches=True),
 }
 
 
@@ -258,7 +255,8 @@ def without(name: str, job: Job, folder: Path) -> tuple[dict[str, Any] | None, s
     with one_thread(), left_out(rule):
         try:
             found = sought(job, numbers) if rule.searches else kept(folder / job.name)
-            changed = dataclasses.replace(rule.weighed(found), limits=numbers)
+            changed = rule.weighed(found)
+            changed = dataclasses.replace(changed, case=dataclasses.replace(changed.case, limits=numbers))
             return contract(engine.decided(changed)), None
         except Exception as e:  # a crash is a result
             return None, f"{type(e).__name__}: {e}"

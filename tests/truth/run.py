@@ -58,7 +58,7 @@ def _result(job: Job, path: Path) -> dict[str, Any]:
     found = sought(job, limits())
     _keep(found, path)
     diagnosis = engine.decided(found)
-    if wrong := relabelled(diagnosis, limits()):
+    if wrong := relabelled(diagnosis):
         raise InputError(str(wrong[0]))
     save(diagnosis.plant, path.with_name("plant.yaml"))
     load(path.with_name("plant.yaml"))

@@ -139,6 +139,6 @@ def diagnose(
     entries = catalogue((CATALOGUE, *map(Path, effects)))
     reserve = tables_of(own.description, held_out)
     outcome = _diagnose(own.description, tables, entries, limits(), reserve)
-    if not anyway and (wrong := relabelled(outcome, limits())):
+    if not anyway and (wrong := relabelled(outcome)):
         raise InputError(f"{wrong[0]} (anyway=True diagnoses in spite of it)")
     return Diagnosis(own, outcome)

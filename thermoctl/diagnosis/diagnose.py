@@ -45,7 +45,6 @@ class Sought:
 
     case: Case
     searched: Searched
-    limits: Thresholds
     reserve: tuple[Table, ...]
     unsure: bool
 
@@ -90,10 +89,10 @@ def sought(
     plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
-    known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory))
+    known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory, numbers))
     known.notes.extend([*hung, *notes, *more])
-    searched = with_laws(known, search(known, numbers), numbers, say)
-    return Sought(known, searched, numbers, tuple(reserve), stopped() and bool(known.budget.untried))
+    searched = with_laws(known, search(known))
+    return Sought(known, searched, tuple(reserve), stopped() and bool(known.budget.untried))
 
 
 def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:
@@ -107,8 +106,8 @@ def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:
 
 def decided(sought: Sought) -> Diagnosis:
     """Decide a search: posterior, findings and their worth, remainder, verdict, missing flow."""
-    known, searched, numbers = sought.case, sought.searched, sought.limits
-    energy = energies(known, searched, numbers)
+    known, searched, numbers = sought.case, sought.searched, sought.case.limits
+    energy = energies(known, searched)
     dims = {e.key: len(e.own) for w in searched.tried for e in w.fitted.hypothesis.effects}
     physics = standing(energy, dims, contained(known.catalogue), numbers)
     tried = {w.fitted.hypothesis.keys: w for w in searched.tried}
@@ -129,10 +128,10 @@ def decided(sought: Sought) -> Diagnosis:
     remains = remainder(known, tried[chosen].fitted)
     unknown, sensors = Missing(), list[str]()
     if remains >= numbers.name and not (chosen or asked):
-        sensors = coloured(known, null, numbers)
+        sensors = coloured(known, null)
         known = replace(known, notes=[*known.notes, *sensors])
     if remains < numbers.name:
-        unknown = flow_missing(known, tried[chosen].fitted, reach.nodes, numbers)
+        unknown = flow_missing(known, tried[chosen].fitted, reach.nodes)
     if unknown.probability >= numbers.name:
         after = replace(after, node=unknown.node or after.node)
         before = before if chosen else after
@@ -175,7 +174,7 @@ def _chosen(
     """Return the effects that stand, the posterior, and the probability that each tested one is confirmed.
 
     `physics`: by hypothesis, the probability that each effect is physics and no misfit."""
-    known, numbers = sought.case, sought.limits
+    known, numbers = sought.case, sought.case.limits
     scores = {keys: tried[keys].score for keys in physics}
     posterior = weigh(scores, physics)
     if posterior.something < numbers.name:
@@ -191,7 +190,7 @@ def _chosen(
     late = late or any(brief(best, key) for key in chosen)
     unsure = [key for key in chosen if key[0] == LAW or late and timed(best, key)]
     # beside known physics whose residual is only noise, there is no misfit that it could imitate
-    quiet = only_noise(known, best, numbers) and not unsure
+    quiet = only_noise(known, best) and not unsure
     if sought.reserve or not quiet:
         fits = {keys: w.fitted for keys, w in tried.items()}
         misfit = late or max(over_noise(known, best)) > numbers.clean

@@ -30,7 +30,6 @@ from thermoctl.diagnosis.data.coordinates import Coordinates
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.hypothesis.candidates import spoken
-from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
 from thermoctl.files.yamlfile import InputError
@@ -46,7 +45,7 @@ HALF = 0.5  # share of the misfit that may stay: a true swap removes nearly all 
 GAIN, SIZE = "sensor_gain", "A"
 
 
-def relabelled(found: Diagnosis, limits: Thresholds) -> list[Finding]:
+def relabelled(found: Diagnosis) -> list[Finding]:
     """Return severe findings where a wrong column explains the recordings better than the diagnosis.
 
     A diagnosis that goes on from an earlier one is not checked: the earlier recordings are not there."""
@@ -54,11 +53,11 @@ def relabelled(found: Diagnosis, limits: Thresholds) -> list[Finding]:
         return []
     first, *more = dict.fromkeys(t.path for t in found.case.tables)
     where = f"{first} and {len(more)} more" if more else first
-    swapped = _swapped(found, limits, where)
+    swapped = _swapped(found, where)
     return [swapped] if swapped else absurd(found, where)
 
 
-def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None:
+def _swapped(found: Diagnosis, where: str) -> Finding | None:
     """Return a finding where the recordings with two columns swapped are far likelier."""
     known, now = found.case, {w.fitted.hypothesis.keys: w.score for w in found.searched.tried}
     inputs = {i.column for i in known.plant.inputs.values()}
@@ -67,7 +66,7 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     best: tuple[float, Hypothesis, Case] | None = None
     goal = known.null.cost
     for h in better_unfitted(known, pairs):
-        budget = Budget(limits.fits, known.budget.progress, known.budget.stopped)
+        budget = Budget(known.limits.fits, known.budget.progress, known.budget.stopped)
         try:
             again = changed(known, [h.change(t) for t in known.tables], goal, budget)
             if again is None:
@@ -81,11 +80,11 @@ def _swapped(found: Diagnosis, limits: Thresholds, where: str) -> Finding | None
     if best is None or known.budget.stopped():
         return None
     _, h, again = best
-    leader, present = search(again, limits).tried[0], found.searched.tried[0]
+    leader, present = search(again).tried[0], found.searched.tried[0]
     if leader.score <= max(now.values()) + proof:
         return None
-    stays = _misfit(known, present.fitted, limits)
-    if stays and _misfit(again, leader.fitted, limits) >= HALF * stays:
+    stays = _misfit(known, present.fitted)
+    if stays and _misfit(again, leader.fitted) >= HALF * stays:
         return None
     effects = ", ".join(spoken(leader.fitted.hypothesis.keys))
     present_effects = ", ".join(spoken(found.best.hypothesis.keys))
@@ -136,9 +135,9 @@ def _drives(known: Case, tables: Sequence[Table]) -> list[Excitation]:
     return [dataclasses.replace(known.null.model.excitation(t), rtol=known.rtol) for t in tables]
 
 
-def _misfit(case: Case, f: Fitted, limits: Thresholds) -> float:
+def _misfit(case: Case, f: Fitted) -> float:
     """Return the sum over outputs of the residual's mean square over the noise, above `clean` squared."""
-    return sum(max(x**2 - limits.clean**2, 0.0) for x in over_noise(case, f))
+    return sum(max(x**2 - case.limits.clean**2, 0.0) for x in over_noise(case, f))
 
 
 def absurd(found: Diagnosis, where: str) -> list[Finding]:

@@ -83,7 +83,7 @@ def diagnose(
         )
     except SimulationError as e:
         raise InputError(f"{plant.file}: the plant cannot follow these recordings at all: {e}") from None
-    if not (anyway or stopped()) and (wrong := relabelled(diagnosis, numbers())):
+    if not (anyway or stopped()) and (wrong := relabelled(diagnosis)):
         raise InputError(f"{wrong[0]} (--anyway diagnoses in spite of it)")
     proposed = None if stopped() else propose(diagnosis, drivable, limits, progress)
     result = contract(diagnosis)

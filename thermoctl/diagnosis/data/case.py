@@ -20,6 +20,7 @@ from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.rows import OUTLIER, noise_of_means, reduced, switches
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.rig import Rig
+from thermoctl.diagnosis.limits import Thresholds, limits
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import give_back, reuse_memory
@@ -117,6 +118,7 @@ class Case:
     rtol: float = RTOL
     memory: Memory = NOTHING  # posterior of earlier recordings
     outliers: Outliers = ()
+    limits: Thresholds = field(default_factory=limits)  # numbers by which the diagnosis decides
 
     @property
     def measured(self) -> list[str]:
@@ -178,10 +180,11 @@ def case(
     catalogue: Mapping[str, Effect],
     budget: Budget,
     memory: Memory = NOTHING,
+    numbers: Thresholds | None = None,
 ) -> Case:
     """Refit the original plant, drop single outliers, fix the coordinates and grids of all hypotheses.
 
-    Rows of long recordings are averaged in blocks (rows.py).
+    Rows of long recordings are averaged in blocks (rows.py). `numbers`: the shipped ones if not given.
     Raises InputError where too few values were measured, or a temperature is neither in degC nor in K."""
     for wrong in other_degrees(plant):
         raise InputError(f"{wrong.where}: {wrong.what}. {wrong.suggestion}")
@@ -224,6 +227,7 @@ def case(
         rtol=rtol,
         memory=memory,
         outliers=dropped,
+        limits=numbers or limits(),
     )
 
 

@@ -10,7 +10,6 @@ from scipy.special import chdtri
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.data.grids import Grid
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.limits import Thresholds
 
 PRESENT = 0.5  # probability of a remainder from which the output's noise is not estimated from its residual
 RARE = 0.05  # an octave contradicts a noise if the chance of so small a power is below this
@@ -80,6 +79,6 @@ def over_noise(case: Case, f: Fitted) -> list[float]:
     return [float(np.sqrt(q)) / level for q, level in zip(squares, levels(case, f), strict=True)]
 
 
-def only_noise(case: Case, f: Fitted, limits: Thresholds) -> bool:
+def only_noise(case: Case, f: Fitted) -> bool:
     """Is the residual about as large as the noise, and no remainder in it certain?"""
-    return max(over_noise(case, f)) <= limits.clean and remainder(case, f) < limits.name
+    return max(over_noise(case, f)) <= case.limits.clean and remainder(case, f) < case.limits.name

@@ -6,7 +6,7 @@ choice among places, signals and forms makes them smaller (`Proposal.cost`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,6 @@ from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, more_terms, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, laws_of, limit_of, refitted_law, settled
-from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.beam import (
     BEATEN,
     NEAR,
@@ -38,7 +37,7 @@ from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant.simulation.simulate import SimulationError
 
 
-def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[str], None]) -> Searched:
+def with_laws(case: Case, result: Searched) -> Searched:
     """Return a search with laws beside the plant alone, and beside the leading hypothesis.
 
     No law is sought if the plant leaves only noise and no effect was found. Nor is one if a single effect
@@ -48,36 +47,32 @@ def with_laws(case: Case, result: Searched, limits: Thresholds, say: Callable[[s
     tried = {w.fitted.hypothesis.keys: w for w in result.tried}
     alone, best = tried[frozenset()], result.tried[0]
     effects = len(best.fitted.hypothesis.effects)
-    if (
-        only_noise(case, best.fitted, limits)
-        and effects < PAIR
-        and (not effects or not _pays(case, best, limits))
-    ):
+    if only_noise(case, best.fitted) and effects < PAIR and (not effects or not _pays(case, best)):
         return result
-    s = Search(case, limits, result.where, tried, set(result.seen), list(result.norms))
+    s = Search(case, result.where, tried, set(result.seen), list(result.norms))
     s.promised, s.refused = dict(result.promised), dict(result.refused)
     s.refitted = {*tried, *s.refused}
     queue, known = [alone, best, *_beside_bounded(s, best)], set[Keys]()
     while queue and not case.budget.stopped():
         parent, *queue = queue
         keys = parent.fitted.hypothesis.keys
-        if keys in known or keys and only_noise(case, parent.fitted, limits):
+        if keys in known or keys and only_noise(case, parent.fitted):
             continue
         known.add(keys)
-        say("looking for a law")
-        quiet, many = only_noise(case, s.best.fitted, limits), len(parent.fitted.hypothesis.effects)
+        case.budget.progress("looking for a law")
+        quiet, many = only_noise(case, s.best.fitted), len(parent.fitted.hypothesis.effects)
         rivals = [s.best if quiet else _leading(s, many + k + 1) for k in range(TERMS)]
         near = NEAR if quiet else BEATEN
         least = tuple(w.score - parent.score - near for w in rivals)
         goal = Goal(least, NEAR if quiet else 0.0, quiet)
         done = case.budget.fits_done
-        _compete(s, _laws(s, parent, goal, say), done)
-        if not only_noise(case, s.best.fitted, limits):
+        _compete(s, _laws(s, parent, goal), done)
+        if not only_noise(case, s.best.fitted):
             queue += _without_laws(s)
-    if not case.budget.stopped() and not only_noise(case, s.best.fitted, limits):
-        say("looking for laws at two places")
+    if not case.budget.stopped() and not only_noise(case, s.best.fitted):
+        case.budget.progress("looking for laws at two places")
         done = case.budget.fits_done
-        _compete(s, _pairs(s, limits), done)
+        _compete(s, _pairs(s), done)
     lead, weighed = s.best, {*s.tried}
     _make_rarer(s, weighed)  # another hypothesis may lead now, with effects that its law makes needless
     if s.best.fitted is not lead.fitted:
@@ -93,7 +88,7 @@ def _make_rarer(s: Search, which: Set[Keys]) -> None:
     for keys in which:
         w = s.tried[keys]
         if any(_replaced(w, law, other) for law in laws_of(w.fitted) for other in s.tried.values()):
-            s.tried[keys] = replace(w, log_odds=w.log_odds + float(np.log(s.limits.rare)))
+            s.tried[keys] = replace(w, log_odds=w.log_odds + float(np.log(s.case.limits.rare)))
 
 
 def _replaced(w: Weighed, law: PlacedLaw, other: Weighed) -> bool:
@@ -137,8 +132,8 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
             s.extended(w)
     if s.best is not before:
         # the search may have spent its refits before it met the law
-        budget = s.case.budget
-        budget.fits = max(budget.fits, budget.fits_done + s.limits.beam * s.limits.shortlist)
+        budget, limits = s.case.budget, s.case.limits
+        budget.fits = max(budget.fits, budget.fits_done + limits.beam * limits.shortlist)
         grow(s)
         swap(s)
         _fewer(s)
@@ -172,7 +167,7 @@ def _more(s: Search, base: Weighed, f: Fitted) -> None:
     for k, law in enumerate(laws):
         others = [*laws[:k], *laws[k + 1 :]]
         try:
-            more = more_terms(s.case, f, law, s.limits)
+            more = more_terms(s.case, f, law, s.case.limits)
         except (SimulationError, np.linalg.LinAlgError):
             more = []
         for p in (p for p in more if len(p.terms) <= TERMS):
@@ -204,20 +199,20 @@ def _leading(s: Search, size: int) -> Weighed:
     return max((w for w in s.tried.values() if _size(w) <= size), key=lambda w: w.score)
 
 
-def _pays(case: Case, best: Weighed, limits: Thresholds) -> bool:
+def _pays(case: Case, best: Weighed) -> bool:
     try:
-        return pays(case, best.fitted, limits)
+        return pays(case, best.fitted, case.limits)
     except (SimulationError, np.linalg.LinAlgError):
         return False
 
 
-def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
+def _pairs(s: Search) -> list[Weighed]:
     """Return the best hypothesis with laws at two places, and with each of these laws alone.
 
     Where a shape is at its bound, the form that the law becomes there is refitted."""
     case, alone = s.case, s.tried[frozenset()].fitted
     try:
-        queue = propose_pairs(case, alone, limits)
+        queue = propose_pairs(case, alone, case.limits)
     except (SimulationError, np.linalg.LinAlgError):
         return []
     found, best = list[Weighed](), alone
@@ -240,7 +235,7 @@ def _pairs(s: Search, limits: Thresholds) -> list[Weighed]:
     return [top, *(s.weighed(f) for f in single if f)]
 
 
-def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) -> list[Weighed]:
+def _laws(s: Search, parent: Weighed, goal: Goal) -> list[Weighed]:
     """Return a hypothesis with the best law at each place, beside a parent and beside parts of it.
 
     Only laws that may reach the goal are refitted.
@@ -248,7 +243,7 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
     them, too, and without those that it makes insignificant. There its promise is larger by their gain."""
     case, alone = s.case, s.tried[frozenset()]
     try:
-        proposals = propose_laws(case, parent.fitted, s.limits)
+        proposals = propose_laws(case, parent.fitted, case.limits)
     except (SimulationError, np.linalg.LinAlgError):
         return []
     keys = parent.fitted.hypothesis.keys
@@ -265,7 +260,7 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
             if base is parent or len(p.terms) == 1 and known >= {*p.place.nodes, *p.reads}
         ]
         least = replace(goal, least=tuple(x + more for x in goal.least))
-        tried = refits(case, base.fitted, some, least, say)
+        tried = refits(case, base.fitted, some, least)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]
 
     bases, groups = [parent], [refitted(parent)]
@@ -273,11 +268,11 @@ def _laws(s: Search, parent: Weighed, goal: Goal, say: Callable[[str], None]) ->
         bases.append(base or alone)
         groups.append(refitted(bases[-1]))
     found = (
-        _best([x for x in some if x[0].place == place], s.limits)
+        _best([x for x in some if x[0].place == place], case.limits.set)
         for some in groups
         for place in {p.place: 0 for p, _ in some}
     )
-    return [w for w in found if w and len(w.fitted.hypothesis.effects) <= s.limits.effects]
+    return [w for w in found if w and len(w.fitted.hypothesis.effects) <= case.limits.effects]
 
 
 def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) -> Weighed | None:
@@ -287,7 +282,7 @@ def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) ->
     effects = base.fitted.hypothesis.effects
     absent = max(laws, key=lambda x: x[1].score)[1].fitted.absent if laws else frozenset()
     rest = tuple(e for e in effects if e.key not in absent)
-    if len(rest) >= s.limits.effects:
+    if len(rest) >= s.case.limits.effects:
         less = [s.tried[k] for e in effects if (k := base.fitted.hypothesis.keys - {e.key}) in s.tried]
         return max(less, key=lambda w: w.score, default=None)
     if len(rest) == len(effects):
@@ -295,7 +290,7 @@ def _part(s: Search, base: Weighed, laws: Sequence[tuple[Proposal, Weighed]]) ->
     return _beside(s, rest, base.fitted)
 
 
-def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weighed | None:
+def _best(laws: Sequence[tuple[Proposal, Weighed]], certain: float) -> Weighed | None:
     """Return the likeliest law at one place whose parts are significant; None if there is none.
 
     Its `rivals` are the others that fit about as well."""
@@ -308,7 +303,7 @@ def _best(laws: Sequence[tuple[Proposal, Weighed]], limits: Thresholds) -> Weigh
     kinds = {laws[order[0]][0].kind}
     rivals: list[tuple[Proposal, Fitted, float]] = []
     for k in order[1:]:
-        if share[k] > 1 - limits.set and laws[k][0].kind not in kinds:
+        if share[k] > 1 - certain and laws[k][0].kind not in kinds:
             kinds.add(laws[k][0].kind)
             rivals.append((laws[k][0], laws[k][1].fitted, float(share[k])))
     *effects, law = best.fitted.hypothesis.effects

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -131,7 +131,7 @@ def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | 
 
 
 def refits(
-    case: Case, parent: Fitted, proposals: Sequence[Proposal], goal: Goal, say: Callable[[str], None]
+    case: Case, parent: Fitted, proposals: Sequence[Proposal], goal: Goal
 ) -> list[tuple[Proposal, Fitted]]:
     """Refit the proposals that may beat the best law so far, and return the refits that end at no bound.
 
@@ -156,7 +156,7 @@ def refits(
         return True
 
     for batch, rest in batches(queue, wanted):
-        say(f"looking for a law: refit {len(queue) - rest} of {len(queue)} at most")
+        case.budget.progress(f"looking for a law: refit {len(queue) - rest} of {len(queue)} at most")
         fits = each(partial(refitted_law, case, parent, leader=leader), batch)
         for p, f in zip(batch, fits, strict=True):
             if f is None:

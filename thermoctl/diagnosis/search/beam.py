@@ -23,8 +23,8 @@ from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, found_again
 from thermoctl.diagnosis.hypothesis.effect import Effect
-from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.again import Known
+from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
 from thermoctl.diagnosis.search.observer import TRUSTS, drifts, held, linear
 from thermoctl.diagnosis.search.refits import free_starts, refitted
@@ -81,7 +81,6 @@ class Search:
     """A search under way: where each effect fits, hypotheses by their effects, and those already extended."""
 
     case: Case
-    limits: Thresholds
     where: Mapping[str, set[str]]
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
@@ -130,17 +129,21 @@ class Search:
 
     def weighed(self, f: Fitted) -> Weighed:
         """Return a refit with its prior odds."""
-        return Weighed(f, odds(f.hypothesis.effects, self.where, self.limits))
+        return Weighed(f, odds(f.hypothesis.effects, self.where, self.case.limits))
+
+    def price(self, d: Direction) -> float:
+        """Return the log prior odds of a screened effect."""
+        return odds((Placed(d.candidate, {}),), self.where, self.case.limits)
 
 
-def search(case: Case, limits: Thresholds) -> Searched:
+def search(case: Case) -> Searched:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
     Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
     searched with an observer, too."""
-    s = started(case, limits)
+    s = started(case)
     null = s.best
-    rivals = [s.weighed(f) for f in mistakes(case, null.fitted, limits.shortlist)]
+    rivals = [s.weighed(f) for f in mistakes(case, null.fitted)]
     if rivals:
         s.keep(rivals)
         s.extended(null)  # also where a rival fits better
@@ -170,9 +173,9 @@ def searched(s: Search) -> Searched:
     )
 
 
-def started(case: Case, limits: Thresholds) -> Search:
+def started(case: Case) -> Search:
     """Return a search that holds the plant without effects."""
-    s = Search(case, limits, places(case))
+    s = Search(case, places(case))
     s.keep([s.weighed(fitted(case, case.plant, (), case.null))])
     recall(s)
     return s
@@ -180,11 +183,11 @@ def started(case: Case, limits: Thresholds) -> Search:
 
 def grow(s: Search) -> None:
     """Extend the beam until none of its extensions is better."""
-    for _ in range(s.limits.effects):
-        first, *others = leaders(list(s.tried.values()), s.limits)
+    for _ in range(s.case.limits.effects):
+        first, *others = leaders(list(s.tried.values()), s.case.limits.beam)
         # one effect more may make such a hypothesis the better one
         fewer = [w for w in others if _number(w) < _number(first)]
-        if only_noise(s.case, first.fitted, s.limits):
+        if only_noise(s.case, first.fitted):
             near = first.score - NEAR
             others = [w for w in others if w.score >= near or _number(w) < _number(first)]
         known = first.fitted.hypothesis.keys in s.seen
@@ -345,7 +348,7 @@ def with_observer(s: Search) -> bool:
     about = linear(case.null, drives)
     if about is None or not drifts(about, max(float(d.t[-1]) for d in drives)):
         return False
-    if only_noise(case, as_refitted(case, s.best.fitted), s.limits):
+    if only_noise(case, as_refitted(case, s.best.fitted)):
         return False
     known = len(s.tried)
     for trust in TRUSTS:
@@ -356,7 +359,7 @@ def with_observer(s: Search) -> bool:
             following = _following(s, plant)
         except (SimulationError, InputError, np.linalg.LinAlgError):
             continue  # the plant with an observer cannot be simulated: the free search stands
-        for w in leaders(list(following.tried.values()), s.limits):
+        for w in leaders(list(following.tried.values()), case.limits.beam):
             effects = w.fitted.hypothesis.effects
             free = rebuilt(s, effects, w.fitted, None) if effects else None
             if free and not free.fitted.absent:
@@ -370,9 +373,9 @@ def _following(s: Search, plant: Plant) -> Search:
     """Return a search with a plant that follows its recordings. Raises SimulationError."""
     case, model = s.case, compile_plant(plant)
     null = refit.fit(model, case.drives(model), case.noise, iterations=WHITE, seconds=np.inf)
-    budget = Budget(s.limits.fits, case.budget.progress, case.budget.stopped)
+    budget = Budget(case.limits.fits, case.budget.progress, case.budget.stopped)
     own = dataclasses.replace(case, plant=plant, null=null, budget=budget, memory=NOTHING)
-    following = started(own, s.limits)
+    following = started(own)
     grow(following)
     return following
 
@@ -382,7 +385,7 @@ def recall(s: Search) -> None:
     past = s.case.memory.hypotheses
     likeliest = max((h.log_evidence for h in past), default=0.0)
     for h in past:
-        far = h.log_evidence < likeliest - BEATEN * s.limits.effects
+        far = h.log_evidence < likeliest - BEATEN * s.case.limits.effects
         if not h.effects or far:
             continue
         if s.case.budget.spent:
@@ -394,7 +397,7 @@ def recall(s: Search) -> None:
                 s.keep([found])
 
 
-def leaders(tried: Sequence[Weighed], limits: Thresholds) -> list[Weighed]:
+def leaders(tried: Sequence[Weighed], most: int) -> list[Weighed]:
     """Return the beam: the best hypotheses by score and by free-run error, in turn.
 
     The error counts, too, because the remainder may absorb an effect that a later extension explains."""
@@ -403,7 +406,7 @@ def leaders(tried: Sequence[Weighed], limits: Thresholds) -> list[Weighed]:
     for pair in zip(*ranked, strict=True):
         for w in pair:
             out.setdefault(w.fitted.hypothesis.keys, w)
-    return list(out.values())[: limits.beam]
+    return list(out.values())[:most]
 
 
 def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
@@ -411,11 +414,11 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
 
     An extension is left out if twice its predicted gain does not bring it to the leader. Every prediction is
     multiplied by the largest ratio so far of a refit's gain to its prediction."""
-    case, where, limits, tried = s.case, s.where, s.limits, s.tried
+    case, limits, tried = s.case, s.case.limits, s.tried
     out: list[Weighed] = []
     # beside effects that leave only noise, two more would imitate a small misfit
-    misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted, limits)
-    queue, ratio = shortlist(looked, where, limits, paired=misfit), 1.0
+    misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted)
+    queue, ratio = shortlist(looked, s.price, limits.shortlist, paired=misfit), 1.0
     new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
     queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
@@ -444,6 +447,6 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
                 out.append(s.weighed(f))
             elif f:
                 queued = {d.candidate.key for ds, _ in queue for d in ds}
-                more = simpler(added, gain, looked, where, limits)
+                more = simpler(added, gain, looked, s.price)
                 queue += [x for x in more if x[0][0].candidate.key not in queued]
     return out

@@ -30,8 +30,8 @@ WIDE = 10.0
 DECADES = tuple(10.0**k for k in range(-6, 7))  # from a wrong digit to an error of two SI prefixes
 
 
-def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
-    """Return the refits of the plant with one significant factor each, of at most `most` factors.
+def mistakes(case: Case, null: Fitted) -> list[Fitted]:
+    """Return the refits of the plant with one significant factor each, of at most `shortlist` factors.
 
     `null`: the refit of the plant without any effect."""
     entries = catalogue((MISTAKES,))
@@ -52,6 +52,7 @@ def mistakes(case: Case, null: Fitted, most: int) -> list[Fitted]:
         except (SimulationError, np.linalg.LinAlgError):
             return None
 
+    most = case.limits.shortlist
     tried = best[: max(min(most, case.budget.fits - case.budget.fits_done), 0)]
     case.budget.untried += len(best[:most]) - len(tried)
     return [f for f in each(refitted, tried) if f is not None and not f.absent]

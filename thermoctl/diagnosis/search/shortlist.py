@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.evidence.fit import Placed
-from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.hypothesis.candidates import EVENTS, Candidate, Key
 from thermoctl.diagnosis.hypothesis.places import displacements
-from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.gains import PLACES_EACH, Direction, foremost, once
 from thermoctl.diagnosis.search.metric import Metric
 from thermoctl.diagnosis.search.screening import Screened
@@ -23,6 +20,7 @@ ALIKE = 0.999  # limit of the cosine between two directions, so that their pair 
 
 
 Extension = tuple[tuple[Direction, ...], float]  # directions to add, and their predicted gain
+Price = Callable[[Direction], float]  # log prior odds of a screened effect
 
 
 def relabels(c: Candidate) -> bool:
@@ -50,13 +48,7 @@ def _free_member(c: Candidate, side: str) -> bool:
     return any(ex.names(ex.derivative(now, n)) & moving == {side} for n in free)
 
 
-def simpler(
-    added: Sequence[Direction],
-    gain: float,
-    looked: Screened,
-    where: Mapping[str, set[str]],
-    limits: Thresholds,
-) -> list[Extension]:
+def simpler(added: Sequence[Direction], gain: float, looked: Screened, price: Price) -> list[Extension]:
     """Return the simpler entries at the places of `added`, to try instead of an insignificant effect.
 
     The entry that an effect contains may gain as much as this one, others what they promise themselves."""
@@ -66,42 +58,34 @@ def simpler(
         if d.gain > 0 and any(d.candidate.effect.name == a.contains for a in here):
             out.append(((d,), gain))
         elif d.gain > 0 and any(len(d.candidate.effect.parameters) < len(a.parameters) for a in here):
-            out.append(((d,), predicted(d, promise, where, limits)))
+            out.append(((d,), promise + price(d)))
     return out
 
 
-def predicted(d: Direction, promise: float, where: Mapping[str, set[str]], limits: Thresholds) -> float:
-    """Return the gain in score that a direction promises: its prior odds are taken off.
-
-    That of its size, 2 to 5 nats, stays: first-order promises of limits and lags err by more."""
-    return float(promise + odds((Placed(d.candidate, {}),), where, limits))
-
-
-def shortlist(
-    looked: Screened, where: Mapping[str, set[str]], limits: Thresholds, paired: bool
-) -> list[Extension]:
+def shortlist(looked: Screened, price: Price, most: int, paired: bool) -> list[Extension]:
     """Return the directions whose predicted gain outweighs their prior odds, then pairs; each with its gain.
 
+    The prior of a size, 2 to 5 nats, is not taken off: first-order promises of limits and lags err by more.
     First are those with the largest predicted gain, the best first. Then come those with the largest gain in
     energy, then pairs. The gain of a proposal by energy is infinite. At most PLACES_EACH places of an effect
-    are listed alone. `paired`: with pairs that are not proposed by energy?"""
+    are listed alone. `most`: largest number of each kind. `paired`: with pairs not proposed by energy?"""
     worthwhile = []
     for d, promise in looked.promised:
-        gain = predicted(d, promise, where, limits)
+        gain = promise + price(d)
         if gain > 0 and d.gain > 0 and not relabels(d.candidate):
             worthwhile.append((d, gain))
     worthwhile.sort(key=lambda x: -x[1])
     gains = {d.candidate.key: gain for d, gain in reversed(worthwhile)}
-    best = foremost(once(d for d, _ in worthwhile), PLACES_EACH)[: limits.shortlist]
+    best = foremost(once(d for d, _ in worthwhile), PLACES_EACH)[:most]
     out: list[Extension] = [
         ((d,), gain) for d in best if HALF * (gain := gains[d.candidate.key]) > worthwhile[0][1]
     ]
     listed = {d.candidate.key for (d,), _ in out}
-    out += [((d,), np.inf) for d in largest(looked)[: limits.shortlist] if d.candidate.key not in listed]
+    out += [((d,), np.inf) for d in largest(looked)[:most] if d.candidate.key not in listed]
     if paired:
-        out += pairs(looked.every, looked.metric, where, limits)
+        out += pairs(looked.every, looked.metric, price, most)
     if looked.energy:
-        out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, where, limits)]
+        out += [(p, np.inf) for p, _ in pairs(looked.by_energy, looked.energy, price, most)]
     return out
 
 
@@ -132,9 +116,7 @@ def _constant(c: Candidate) -> bool:
     return EVENTS.isdisjoint(c.effect.shapes.values()) and not relabels(c)
 
 
-def pairs(
-    directions: Sequence[Direction], metric: Metric, where: Mapping[str, set[str]], limits: Thresholds
-) -> list[Extension]:
+def pairs(directions: Sequence[Direction], metric: Metric, price: Price, most: int) -> list[Extension]:
     """Return pairs of constant physics, at their joint sizes, that explain far more together than one by one.
 
     The plant's own parameters may imitate each effect of a pair alone, but not both together. So only their
@@ -148,7 +130,7 @@ def pairs(
     # size of the first beside the second, along its unit vector
     first = (g[:, None] - c * g[None]) / (1 - c**2)
     joint = g[:, None] * first + g[None] * first.T
-    own = np.array([odds((Placed(d.candidate, {}),), where, limits) for d in kept])
+    own = np.array([price(d) for d in kept])
     alone = np.array([d.gain for d in kept])
     extra = np.triu(joint - np.maximum.outer(alone, alone), 1)
     worth = (extra > np.maximum.outer(alone, alone)) & (0.5 * joint + np.add.outer(own, own) > 0)
@@ -160,7 +142,7 @@ def pairs(
             left = metric.residual - first[a, b] * v[a] - first[b, a] * v[b]
             promise = metric.around.rise(metric.powers(left))
             out.append((tuple(d for d in pair if d is not None), float(promise + own[a] + own[b])))
-        if len(out) >= limits.shortlist // PAIR:
+        if len(out) >= most // PAIR:
             break
     return out
 

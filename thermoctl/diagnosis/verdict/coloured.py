@@ -22,7 +22,6 @@ from thermoctl.diagnosis.data.grids import Grid
 from thermoctl.diagnosis.data.spectra import first_order
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.where import signals
-from thermoctl.diagnosis.limits import Thresholds
 
 SHARES = 1 - np.array([0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9])  # a
 TIMES = 20  # correlation times in all recordings together, at least: of fewer, no spectrum is known
@@ -31,11 +30,11 @@ PARTS = 8  # number of parts of a recording, none of which may have too large a 
 LAGS = (0, 1, 2, 4, 8, 16, 32, 64)  # rows by which a signal may be earlier
 
 
-def coloured(case: Case, f: Fitted, limits: Thresholds) -> list[str]:
+def coloured(case: Case, f: Fitted) -> list[str]:
     """Return a sentence for each output with a certain remainder; none if one is not its noise alone."""
     out = []
     for name, g, p in zip(case.measured, case.grids, f.average.remainder, strict=True):
-        if p < limits.name:
+        if p < case.limits.name:
             continue
         interval = case.coordinates.channels[g.channels[0]].interval
         size, share, time = _likeliest(g, g.power(f.powers))

@@ -149,22 +149,22 @@ def deviations(f: Fitted, energy: Mapping[Keys, Energy], limits: Thresholds) -> 
     return sd
 
 
-def energies(case: Case, searched: Searched, limits: Thresholds) -> Mapping[Keys, Energy]:
+def energies(case: Case, searched: Searched) -> Mapping[Keys, Energy]:
     """Return the energies of all hypotheses.
 
-    Up to `limits.clean` times its noise a residual is no misfit, unless a remainder is certain there. The
+    Up to `clean` times its noise a residual is no misfit, unless a remainder is certain there. The
     noise is the estimate of the leading hypothesis: a stated noise that is too large would hide the misfit. A
     hypothesis has two refits (`as_refitted`). The one with less energy is used."""
     own = searched.tried[0].fitted.average.sensor
     noise = list(zip(own, rounded(case), strict=True))
     out = {}
     for w in searched.tried:
-        both = [_energy(case, f, noise, limits) for f in (w.fitted, as_refitted(case, w.fitted))]
+        both = [_energy(case, f, noise) for f in (w.fitted, as_refitted(case, w.fitted))]
         out[w.fitted.hypothesis.keys] = min(both, key=lambda e: e.all)
     return out
 
 
-def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: Thresholds) -> Energy:
+def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]]) -> Energy:
     """Return the energies of a refit.
 
     `noise`: by output the noise's variance, and whether the reading is coarsely rounded."""
@@ -173,6 +173,6 @@ def _energy(case: Case, f: Fitted, noise: Sequence[tuple[float, bool]], limits: 
         power = sum(float(f.powers[k].sum()) for k in g.channels) + f.past.squares.get(g.output, 0.0)
         rows = float(g.count.sum()) + f.past.counts.get(g.output, 0.0)
         square = power / (rows * own)
-        noisy = 1.0 if p >= limits.name and not coarse else limits.clean**2
+        noisy = 1.0 if p >= case.limits.name and not coarse else case.limits.clean**2
         parts.append((square, max(square - noisy, 0.0), rows))
     return Energy(*zip(*parts, strict=True))

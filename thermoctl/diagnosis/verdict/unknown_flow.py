@@ -57,7 +57,7 @@ class Missing:
         return ""
 
 
-def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Thresholds) -> Missing:
+def flow_missing(case: Case, f: Fitted, nodes: Sequence[str]) -> Missing:
     """Return the probability that an unknown flow into or between nodes is missing in a fitted hypothesis.
 
     Its prior odds are `missing` (any physics) times `rare` (a function of time), shared among its places."""
@@ -67,6 +67,7 @@ def flow_missing(case: Case, f: Fitted, nodes: Sequence[str], limits: Thresholds
         return Missing()
     if not gains:
         return Missing()
+    limits = case.limits
     odds = np.log(limits.missing / (1 - limits.missing)) + np.log(limits.rare) - np.log(len(gains))
     p = float(expit(logsumexp(list(gains.values())) + odds))
     best = max(gains, key=lambda where: gains[where])
