@@ -45,7 +45,7 @@ def test_an_effect_that_a_parameter_of_the_plant_may_replace_is_kept():
     names = ("temperature_dependent_conductance", "variable_heat_capacity", "hidden_thermal_mass")
     entries = {n: e for n, e in catalogue().items() if n in names}
     found = search(case(plant, [table], entries, Budget(80)))
-    assert found.tried[0].fitted.hypothesis.keys == {("temperature_dependent_conductance", "loss")}
+    assert found.best.fitted.hypothesis.keys == {("temperature_dependent_conductance", "loss")}
 
 
 def test_one_law_competes_with_two_effects_that_imitate_it():

@@ -18,7 +18,7 @@ from thermoctl.diagnosis.experiment.propose import bits, distances, propose
 from thermoctl.diagnosis.experiment.resolve import resolve
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.search.beam import search
+from thermoctl.diagnosis.search.beam import search, searched
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.experiments import load_experiments, load_inputs
 from thermoctl.plant import loads
@@ -65,14 +65,13 @@ def shared_by_two(belief, truth, inputs):
     entries = {k: e for k, e in catalogue((CATALOGUE,)).items() if k in two}
     known = case(loads(belief), [table], entries, Budget(30))
     numbers = dataclasses.replace(limits(), effects=1)
-    one, other = (search(dataclasses.replace(known, catalogue={k: entries[k]}, limits=numbers)) for k in two)
-    searched = dataclasses.replace(
-        one, tried=(*one.tried, *(w for w in other.tried if w.fitted.hypothesis.keys))
-    )
-    single = [w.fitted.hypothesis.keys for w in searched.tried if w.fitted.hypothesis.keys]
+    apart = (dataclasses.replace(known, catalogue={k: entries[k]}, limits=numbers) for k in two)
+    one, other = (searched(search(x)) for x in apart)
+    both = dataclasses.replace(one, tried=(*one.tried, *(w for w in other.tried if w.fitted.hypothesis.keys)))
+    single = [w.fitted.hypothesis.keys for w in both.tried if w.fitted.hypothesis.keys]
     assert {e for keys in single for e, _ in keys} == set(two)
     best = [next(k for k in single if e in {n for n, _ in k}) for e in two]
-    return undecided_between(known, searched, best)
+    return undecided_between(known, both, best)
 
 
 def undecided_between(known, searched, hypotheses, verdict="ambiguous"):

@@ -220,7 +220,7 @@ RULES: Mapping[str, Rule] = {
         {"law.contest.pays": lambda case, f, limits: True},
         searches=True,
     ),
-    "laws": Rule("laws compete", {"diagnose.with_laws": lambda case, found: found}, searches=True),
+    "laws": Rule("laws compete", {"diagnose.with_laws": lambda s: s}, searches=True),
 }
 
 

@@ -24,7 +24,7 @@ from thermoctl.diagnosis.law.refit import laws_of
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.diagnosis.search.beam import Searched, Weighed, search
+from thermoctl.diagnosis.search.beam import Searched, Weighed, search, searched
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.coloured import coloured
 from thermoctl.diagnosis.verdict.confirm import Confirm, brief, confirmed, timed
@@ -91,8 +91,8 @@ def sought(
     budget = Budget(numbers.fits, say, stopped)
     known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory, numbers))
     known.notes.extend([*hung, *notes, *more])
-    searched = with_laws(known, search(known))
-    return Sought(known, searched, tuple(reserve), stopped() and bool(known.budget.untried))
+    found = searched(with_laws(search(known)))
+    return Sought(known, found, tuple(reserve), stopped() and bool(known.budget.untried))
 
 
 def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:

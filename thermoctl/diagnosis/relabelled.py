@@ -80,7 +80,7 @@ def _swapped(found: Diagnosis, where: str) -> Finding | None:
     if best is None or known.budget.stopped():
         return None
     _, h, again = best
-    leader, present = search(again).tried[0], found.searched.tried[0]
+    leader, present = search(again).best, found.searched.tried[0]
     if leader.score <= max(now.values()) + proof:
         return None
     stays = _misfit(known, present.fitted)

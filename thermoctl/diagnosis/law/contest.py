@@ -22,36 +22,22 @@ from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
 from thermoctl.diagnosis.law.propose import TERMS, Proposal, more_terms, propose_laws, propose_pairs
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, laws_of, limit_of, refitted_law, settled
-from thermoctl.diagnosis.search.beam import (
-    BEATEN,
-    NEAR,
-    Search,
-    Searched,
-    Weighed,
-    grow,
-    rebuilt,
-    searched,
-    swap,
-)
+from thermoctl.diagnosis.search.beam import BEATEN, NEAR, Search, Weighed, grow, rebuilt, swap
 from thermoctl.diagnosis.search.shortlist import PAIR
 from thermoctl.plant.simulation.simulate import SimulationError
 
 
-def with_laws(case: Case, result: Searched) -> Searched:
-    """Return a search with laws beside the plant alone, and beside the leading hypothesis.
+def with_laws(s: Search) -> Search:
+    """Add laws to a search and return it: beside the plant alone, and beside the leading hypothesis.
 
     No law is sought if the plant leaves only noise and no effect was found. Nor is one if a single effect
     leaves only noise and no law is worth its odds beside it (`pays`). The size of a residual alone does not
     see tens of nats, by which a law may fit better than the effect that imitates it. Two effects may imitate
     one law with more parameters than it has. Nothing is left beside them then, so a law is always tried."""
-    tried = {w.fitted.hypothesis.keys: w for w in result.tried}
-    alone, best = tried[frozenset()], result.tried[0]
+    case, alone, best = s.case, s.tried[frozenset()], s.best
     effects = len(best.fitted.hypothesis.effects)
     if only_noise(case, best.fitted) and effects < PAIR and (not effects or not _pays(case, best)):
-        return result
-    s = Search(case, result.where, tried, set(result.seen), list(result.norms))
-    s.promised, s.refused = dict(result.promised), dict(result.refused)
-    s.refitted = {*tried, *s.refused}
+        return s
     queue, known = [alone, best, *_beside_bounded(s, best)], set[Keys]()
     while queue and not case.budget.stopped():
         parent, *queue = queue
@@ -78,7 +64,8 @@ def with_laws(case: Case, result: Searched) -> Searched:
     if s.best.fitted is not lead.fitted:
         _fewer(s)
         _make_rarer(s, s.tried.keys() - weighed)
-    return searched(s)
+    s.admit()
+    return s
 
 
 def _make_rarer(s: Search, which: Set[Keys]) -> None:

@@ -64,13 +64,12 @@ class Searched:
     """All hypotheses tried, best first; whether the budget ended the search.
 
     `norms`: of all columns in the screening without effects; empty where not all were screened.
-    `seen`: hypotheses that were extended; `where`: the places where each effect fits. `promised`: the
-    largest first-order gain of a placed effect, nats; `refused`: refits that are no hypotheses, and why."""
+    `where`: the places where each effect fits. `promised`: the largest first-order gain of a placed effect,
+    nats; `refused`: refits that are no hypotheses, and why."""
 
     tried: tuple[Weighed, ...]
     truncated: bool
     norms: Sequence[Norms] = ()
-    seen: frozenset[Keys] = frozenset()
     where: Mapping[str, set[str]] = field(default_factory=dict)
     promised: Mapping[Key, float] = field(default_factory=dict)
     refused: Mapping[Keys, str] = field(default_factory=dict)
@@ -85,10 +84,9 @@ class Search:
     tried: dict[Keys, Weighed] = field(default_factory=dict)
     seen: set[Keys] = field(default_factory=set)
     norms: list[Norms] = field(default_factory=list)  # norms of the screening without effects
-    refitted: set[Keys] = field(default_factory=set)  # extensions, kept or not: none is refitted twice
     promised: dict[Key, float] = field(default_factory=dict)  # largest first-order gain of a placed effect
     known: Known = field(default_factory=Known)  # rows of the first screening
-    refused: dict[Keys, str] = field(default_factory=dict)  # refits that are no hypotheses: why
+    refused: dict[Keys, str] = field(default_factory=dict)  # extensions, and why each may be no hypothesis
     like: dict[Keys, Weighed] = field(default_factory=dict)  # refused, but contains a simpler entry
 
     @property
@@ -108,6 +106,18 @@ class Search:
         self.refused[keys] = INSIGNIFICANT if f else FAILED
         if f and not f.absent and any(e.candidate.effect.contains for e in f.hypothesis.effects):
             self.like[keys] = self.weighed(f)
+
+    def admit(self) -> None:
+        """Keep refused hypotheses with an entry that contains a simpler one, at most as likely as with that.
+
+        The data do not tell the two apart where the other part of the entry may be nothing."""
+        for keys, w in self.like.items():
+            for e in w.fitted.hypothesis.effects:
+                simple = (e.candidate.effect.contains or "", e.key[1])
+                simpler = self.tried.get(keys - {e.key} | {simple})
+                if simpler and keys not in self.tried:
+                    odds = min(w.log_odds, simpler.score - w.fitted.log_evidence)
+                    self.tried[keys] = Weighed(w.fitted, odds)
 
     def extended(self, parent: Weighed) -> list[Weighed]:
         """Extend a hypothesis, once."""
@@ -136,7 +146,7 @@ class Search:
         return odds((Placed(d.candidate, {}),), self.where, self.case.limits)
 
 
-def search(case: Case) -> Searched:
+def search(case: Case) -> Search:
     """Extend the best hypotheses until no predicted gain outweighs its prior odds, or the budget is spent.
 
     Wrong numbers of the plant file are rivals. Where a rig that drifts far is left with a misfit, it is
@@ -152,25 +162,15 @@ def search(case: Case) -> Searched:
     if with_observer(s):
         grow(s)
         swap(s)
-    return searched(s)
+    s.admit()
+    return s
 
 
 def searched(s: Search) -> Searched:
-    """Return the result of a search.
-
-    The data do not tell an entry from one that contains it and whose other part may be nothing. So this
-    one is kept, too, at most as likely."""
-    tried = dict(s.tried)
-    for keys, w in s.like.items():
-        for e in w.fitted.hypothesis.effects:
-            simpler = s.tried.get(keys - {e.key} | {(e.candidate.effect.contains or "", e.key[1])})
-            if simpler and keys not in tried:
-                tried[keys] = Weighed(w.fitted, min(w.log_odds, simpler.score - w.fitted.log_evidence))
-    order = tuple(sorted(tried.values(), key=lambda w: -w.score))
-    refused = {keys: why for keys, why in s.refused.items() if keys not in tried}
-    return Searched(
-        order, bool(s.case.budget.untried), s.norms, frozenset(s.seen), s.where, dict(s.promised), refused
-    )
+    """Return the result of a search."""
+    order = tuple(sorted(s.tried.values(), key=lambda w: -w.score))
+    refused = {keys: why for keys, why in s.refused.items() if keys not in s.tried}
+    return Searched(order, bool(s.case.budget.untried), s.norms, s.where, s.promised, refused)
 
 
 def started(case: Case) -> Search:
@@ -426,14 +426,14 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         """Return whether an extension is new and may win, and a refit is left."""
         added, gain = item
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or keys in s.refitted or len(keys) > limits.effects:
+        if keys in tried or keys in s.refused or len(keys) > limits.effects:
             return False
         if parent.score + HALF * ratio * gain < max(w.score for w in [*tried.values(), *out]):
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
             return False
-        s.refitted.add(keys)
+        s.refuse(keys, None)  # until it is refitted: a second one is not new
         return True
 
     for batch, left in batches(queue, wanted):
