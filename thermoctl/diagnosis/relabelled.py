@@ -25,17 +25,16 @@ import numpy as np
 
 from thermoctl.checks.finding import Finding
 from thermoctl.checks.labels import RARITY, Hypothesis, swaps
-from thermoctl.diagnosis.data.case import ROUGH, Budget, Case, grids_of
+from thermoctl.diagnosis.data.case import FAILS, ROUGH, Budget, Case, grids_of
 from thermoctl.diagnosis.data.coordinates import Coordinates
 from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
 from thermoctl.diagnosis.hypothesis.candidates import spoken
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.search.beam import search
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.fitting.residuals import Problem
-from thermoctl.plant.simulation.simulate import Excitation, SimulationError
+from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.recording.table import Table
 
 # Least and largest gain of a real sensor: a stem in still air reads a third at worst; 1.8 would be degF for
@@ -73,7 +72,7 @@ def _swapped(found: Diagnosis, where: str) -> Finding | None:
                 continue
             goal = again.null.cost
             score = fitted(again, again.plant, (), again.null).log_evidence
-        except (SimulationError, InputError, np.linalg.LinAlgError):
+        except FAILS:
             continue
         if score > now[frozenset()] + proof and (best is None or score > best[0]):
             best = score, h, again
@@ -111,7 +110,7 @@ def unfitted_cost(known: Case, tables: Sequence[Table]) -> float:
     try:
         problem = Problem(known.null.model, _drives(known, tables), known.noise)
         return problem.evaluate(problem.start({}), False).cost
-    except (SimulationError, InputError):
+    except FAILS:
         return np.inf
 
 

@@ -28,7 +28,14 @@ from thermoctl.plant.fitting.refit import Fit, fit_by_first_parts
 from thermoctl.plant.fitting.whitening import Noise
 from thermoctl.plant.language import Plant, SensorNoise
 from thermoctl.plant.parts import direct_outputs
-from thermoctl.plant.simulation.simulate import RTOL, Excitation, Model, compile_plant, filled
+from thermoctl.plant.simulation.simulate import (
+    RTOL,
+    Excitation,
+    Model,
+    SimulationError,
+    compile_plant,
+    filled,
+)
 from thermoctl.recording.table import Table
 
 LEAST = 40  # least number of measured values of at least one output
@@ -42,6 +49,8 @@ ROUGH = 1e-2  # tolerance of the first refit: the posterior is climbed from ther
 # Progress gives the time of the planned refits if it is not short, from this number of refits of a step on.
 SHORT_S, KNOWN = 30.0, 4
 
+# Errors of the simulation of a hypothesis, or of its refit: the hypothesis is left out.
+FAILS = (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError)
 
 Outliers = tuple[tuple[str, str, tuple[float, ...]], ...]  # recording, column, times in s
 

@@ -13,13 +13,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from thermoctl.checks.data import driving_inputs
-from thermoctl.diagnosis.data.case import ROUGH, Budget, Case
+from thermoctl.diagnosis.data.case import FAILS, ROUGH, Budget, Case
 from thermoctl.diagnosis.evidence.fit import fitted
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.refit import fit
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import compile_plant
 
 # Nats by which straight lines have to fit better. Where inputs are held, they fitted at most 13 better, on 11
 # real rigs, 4 systems and 20 generated cases, and 32 where radiation is missing in four recordings. Where
@@ -49,7 +48,7 @@ def between(plant: Plant, made: Callable[[Plant], Case]) -> Case:
         held, straight = _alone(case), _alone(case, dataclasses.replace(case.plant, inputs=inputs))
         if straight <= held + CLEARLY or _alone(case, _early(case, [i.name for i in loose])) > straight:
             return case
-    except (InputError, SimulationError, np.linalg.LinAlgError):
+    except FAILS:
         return case
     better, names = made(dataclasses.replace(plant, inputs=inputs)), ", ".join(f"'{i.name}'" for i in loose)
     better.notes.append(

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import stdtr
 
-from thermoctl.diagnosis.data.case import Case, outlier_note, without_outliers
+from thermoctl.diagnosis.data.case import FAILS, Case, outlier_note, without_outliers
 from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationError, compile_plant
@@ -155,7 +154,7 @@ def _errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     d = model.excitation(table)
     try:
         fitted = refit.fit_by_first_parts(model, [d], case.noise, tolerance=1e-3, seconds=np.inf)
-    except (SimulationError, InputError):  # InputError: it has no reading
+    except FAILS:  # InputError: it has no reading
         return np.full_like(d.y, np.nan)
     return fitted.residuals[0]
 

@@ -9,12 +9,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.posterior import Placed
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError
 
 TIMES = ("onset", "start", "end")  # shapes that are the time of a jump
 ONSETS = 24  # number of onset times in a screening's grid over the recordings
@@ -88,6 +87,6 @@ class _Search:
         try:
             now = self.problem.evaluate(z, self.followed)
             fall = now.gradient @ np.linalg.solve(now.matrix, now.gradient) if self.followed else 0.0
-        except (SimulationError, np.linalg.LinAlgError):
+        except FAILS:
             return float("inf")
         return float(now.cost - fall)

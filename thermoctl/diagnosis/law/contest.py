@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import softmax
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
@@ -24,7 +24,6 @@ from thermoctl.diagnosis.law.propose import TERMS, Proposal, more_terms, propose
 from thermoctl.diagnosis.law.refit import PlacedLaw, at_bound, laws_of, limit_of, refitted_law, settled
 from thermoctl.diagnosis.search.beam import BEATEN, NEAR, Search, Weighed, grow, rebuilt, swap
 from thermoctl.diagnosis.search.shortlist import PAIR
-from thermoctl.plant.simulation.simulate import SimulationError
 
 
 def with_laws(s: Search) -> Search:
@@ -155,7 +154,7 @@ def _more(s: Search, base: Weighed, f: Fitted) -> None:
         others = [*laws[:k], *laws[k + 1 :]]
         try:
             more = more_terms(s.case, f, law, s.case.limits)
-        except (SimulationError, np.linalg.LinAlgError):
+        except FAILS:
             more = []
         for p in (p for p in more if len(p.terms) <= TERMS):
             _keep_laws(s, base, [p, *others])
@@ -189,7 +188,7 @@ def _leading(s: Search, size: int) -> Weighed:
 def _pays(case: Case, best: Weighed) -> bool:
     try:
         return pays(case, best.fitted, case.limits)
-    except (SimulationError, np.linalg.LinAlgError):
+    except FAILS:
         return False
 
 
@@ -200,7 +199,7 @@ def _pairs(s: Search) -> list[Weighed]:
     case, alone = s.case, s.tried[frozenset()].fitted
     try:
         queue = propose_pairs(case, alone, case.limits)
-    except (SimulationError, np.linalg.LinAlgError):
+    except FAILS:
         return []
     found, best = list[Weighed](), alone
     for pair in queue:
@@ -231,7 +230,7 @@ def _laws(s: Search, parent: Weighed, goal: Goal) -> list[Weighed]:
     case, alone = s.case, s.tried[frozenset()]
     try:
         proposals = propose_laws(case, parent.fitted, case.limits)
-    except (SimulationError, np.linalg.LinAlgError):
+    except FAILS:
         return []
     keys = parent.fitted.hypothesis.keys
     taken = {key[1] for key in keys if key[0] == LAW}

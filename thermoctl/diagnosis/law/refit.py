@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.hypothesis import places as catalogue_places
 from thermoctl.diagnosis.hypothesis.candidates import Candidate
@@ -18,10 +18,9 @@ from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.law.forms import Form, Term, combined, law_effect, library, of_plant, readable
 from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
-from thermoctl.plant.simulation.simulate import Excitation, SimulationError
+from thermoctl.plant.simulation.simulate import Excitation
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
 SIMPLER = 6  # number of further refits, of sums without their least significant term
@@ -57,16 +56,16 @@ def refitted_law(
     that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
     drives: Sequence[Excitation] = case.drives(parent.rough.model)
-    for q in (p, *more):
-        c = law_candidate(case.rig(plant, drives), q)
-        values, ranges = _start(q)
-        plant, before = c.extend(values, ranges), plant
-        drives = case.drives_after(plant, before, drives)
-        own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
-        effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
     try:
+        for q in (p, *more):
+            c = law_candidate(case.rig(plant, drives), q)
+            values, ranges = _start(q)
+            plant, before = c.extend(values, ranges), plant
+            drives = case.drives_after(plant, before, drives)
+            own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
+            effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
         return fitted(case, plant, effects, None, leader, parent)
-    except (SimulationError, InputError, np.linalg.LinAlgError, ex.ExpressionError):
+    except FAILS:
         return None
 
 

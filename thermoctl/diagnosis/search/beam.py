@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Budget, Case
+from thermoctl.diagnosis.data.case import FAILS, Budget, Case
 from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
 from thermoctl.diagnosis.evidence.fit import (
     WHITE,
@@ -31,11 +31,10 @@ from thermoctl.diagnosis.search.refits import free_starts, refitted
 from thermoctl.diagnosis.search.screen import Norms
 from thermoctl.diagnosis.search.screening import Screened, places, screened
 from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, shortlist, simpler
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import Excitation, SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Excitation, compile_plant
 
 INSIGNIFICANT = "refitted, and it or a part of it is not significant"
 FAILED = "its refit could not be simulated"
@@ -334,7 +333,7 @@ def remade(
             drives = case.drives_after(plant, before, drives)
             placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))
         return s.weighed(fitted(case, free_starts(case.plant, plant), placed, None, leader, near))
-    except (StopIteration, SimulationError, InputError, np.linalg.LinAlgError):
+    except (StopIteration, *FAILS):
         return None
 
 
@@ -357,7 +356,7 @@ def with_observer(s: Search) -> bool:
             break
         try:
             following = _following(s, plant)
-        except (SimulationError, InputError, np.linalg.LinAlgError):
+        except FAILS:
             continue  # the plant with an observer cannot be simulated: the free search stands
         for w in leaders(list(following.tried.values()), case.limits.beam):
             effects = w.fitted.hypothesis.effects

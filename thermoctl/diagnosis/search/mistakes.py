@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.evidence.posterior import Posterior
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, Key, candidates
@@ -49,7 +49,7 @@ def mistakes(case: Case, null: Fitted) -> list[Fitted]:
         _, plant, placed = start
         try:
             return None if case.budget.stopped() else fitted(case, plant, (placed,), parent=null)
-        except (SimulationError, np.linalg.LinAlgError):
+        except FAILS:
             return None
 
     most = case.limits.shortlist

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, fitted
 from thermoctl.diagnosis.evidence.onsets import TIMES
 from thermoctl.diagnosis.hypothesis.effect import EffectParameter
@@ -17,11 +17,10 @@ from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.screen import sharpened
 from thermoctl.diagnosis.search.screening import Screened
 from thermoctl.diagnosis.search.shortlist import Extension
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import each
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
+from thermoctl.plant.simulation.simulate import Excitation
 
 SHORTEST = 0.1  # shortest lag of a reading of held inputs, in sampling intervals
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor: an axis
@@ -42,20 +41,18 @@ def _refitted(
     case: Case, parent: Fitted, added: Sequence[Direction], looked: Screened, leader: Fitted
 ) -> Fitted | None:
     effects, plant = parent.hypothesis.effects, parent.rough_plant
-    drives = looked.metric.drives
+    drives: Sequence[Excitation] = looked.metric.drives
     try:
         for d in added:
             rig = case.rig(plant, drives)
             d = dataclasses.replace(d, candidate=dataclasses.replace(d.candidate, rig=rig))
-            inputs = plant.inputs.keys()
-            plant, own = extend(d)
+            (plant, own), before = extend(d), plant
             if not own:  # an earlier effect replaced the place it acts on, so that it would change nothing
                 return None
-            if plant.inputs.keys() != inputs:  # a column of the recordings that an effect needs
-                drives = case.drives(compile_plant(plant))
+            drives = case.drives_after(plant, before, drives)
             effects = (*effects, Placed(d.candidate, own))
         return fitted(case, free_starts(parent.plant, plant), effects, None, leader, parent)
-    except (SimulationError, InputError, np.linalg.LinAlgError):
+    except FAILS:
         return None
 
 

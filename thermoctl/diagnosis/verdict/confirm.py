@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.fft import dct
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.data.coordinates import FEWEST
 from thermoctl.diagnosis.evidence.fit import UNIFORM, Fitted, as_refitted
 from thermoctl.diagnosis.evidence.held_out import errors_aside
@@ -207,7 +207,7 @@ class Confirm:
         if (keys, across) not in self._known:
             try:
                 energy = self._aside(keys) if self.reserve else self._left_out(keys, across)
-            except (SimulationError, np.linalg.LinAlgError):
+            except FAILS:
                 energy = None
             self._known[keys, across] = None if energy is None else np.log(energy + FLOOR)
         return self._known[keys, across]

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import expit, logsumexp
 
-from thermoctl.diagnosis.data.case import Case
+from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.levels import rounded
 from thermoctl.diagnosis.evidence.where import typical_flow, typical_rate
@@ -30,7 +30,6 @@ from thermoctl.diagnosis.law.smooth import flow_rows, hat_functions
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.plant.language import Plant
-from thermoctl.plant.simulation.simulate import SimulationError
 
 # Knots of a recording, at most and at least, and about how many in all recordings together.
 KNOTS, FEWEST, TOGETHER = 24, 6, 240
@@ -63,7 +62,7 @@ def flow_missing(case: Case, f: Fitted, nodes: Sequence[str]) -> Missing:
     Its prior odds are `missing` (any physics) times `rare` (a function of time), shared among its places."""
     try:
         gains = flow_gains(case, f, nodes)
-    except (SimulationError, np.linalg.LinAlgError):
+    except FAILS:
         return Missing()
     if not gains:
         return Missing()
