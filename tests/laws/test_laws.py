@@ -82,7 +82,7 @@ def test_the_entry_holds_units_and_the_report_draws_the_curve(found):
     _, d, law = found
     entry = json.loads(json.dumps(law_entry([law], d.worth)))
     assert entry["into"] == "broth" and entry["parameters"]["A1"]["unit"] == "W"
-    page = law_section([law], entry)
+    page = law_section([law], {"remainder": {"law": entry}})
     assert "<svg" in page and "95 %" in page
 
 

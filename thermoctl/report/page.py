@@ -100,6 +100,16 @@ def cell(v: object) -> str:
     return (f"{mantissa}·10<sup>{int(power)}</sup>" if e else mantissa).replace("-", "−")
 
 
+def paragraph(text: str) -> str:
+    """Return a paragraph of plain text."""
+    return f"<p>{html.escape(text)}</p>"
+
+
+def items(lines: Sequence[str]) -> str:
+    """Return a list of plain lines; '' without one."""
+    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
 def folded(title: str, body: str) -> str:
     """Return a body that opens by a click on its title."""
     return f"<details><summary>{html.escape(title)}</summary>{body}</details>" if body else ""

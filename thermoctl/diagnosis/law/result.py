@@ -19,14 +19,14 @@ from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.forms import MARK
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import equation, law_rate, laws_of, plain
-from thermoctl.diagnosis.report.figures import WIDE, parameter_rows
-from thermoctl.diagnosis.report.words import every_law, law_sentence
+from thermoctl.diagnosis.report.figures import WIDE, every_law, parameter_rows
+from thermoctl.diagnosis.report.words import law_sentence
 from thermoctl.files.safe_file import make_folder, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Plant
-from thermoctl.report.page import BLUE, FAINT, GREY, panel, panels, table, unit
+from thermoctl.report.page import BLUE, FAINT, GREY, items, panel, panels, paragraph, table, unit
 
 SAME = 0.05  # largest difference of two flows that are taken for one, over their size
 
@@ -129,24 +129,18 @@ def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
     return out
 
 
-def law_section(laws: Sequence[FoundLaw], entry: Mapping[str, Any] | None) -> str:
+def law_section(laws: Sequence[FoundLaw], result: Mapping[str, Any]) -> str:
     """Return the report's section: each law, its parameters, its family, and the curve with its band."""
-    if entry is None:
-        return ""
-    drawn = (_drawn(law, e) for law, e in zip(laws, every_law(entry), strict=True))
-    return (
-        "".join(drawn)
-        + "<p>thermoctl effects save DIR NAME writes each as an effect of your own catalogue.</p>"
-    )
+    drawn = [_drawn(law, e) for law, e in zip(laws, every_law(result), strict=True)]
+    saved = paragraph("thermoctl effects save DIR NAME writes each as an effect of your own catalogue.")
+    return "".join([*drawn, saved]) if drawn else ""
 
 
 def _drawn(law: FoundLaw, entry: Mapping[str, Any]) -> str:
-    body = f"<p>{html.escape(law_sentence(entry))}</p><pre>{html.escape(entry['expression'])}</pre>"
+    body = f"{paragraph(law_sentence(entry))}<pre>{html.escape(entry['expression'])}</pre>"
     heads, rows = parameter_rows(entry)
     body += table(heads, [(n, value, unit(of)) for n, value, of in rows])
-    if entry["equivalent"]:
-        body += "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in entry["equivalent"]) + "</ul>"
-    return body + _drawing(law)
+    return body + items(entry["equivalent"]) + _drawing(law)
 
 
 def _drawing(law: FoundLaw) -> str:
@@ -255,7 +249,7 @@ def save_effect(result: Mapping[str, Any], label: str, folder: Path) -> list[Pat
     """Write the laws of a diagnosis as effect files, and return their paths. Raises InputError.
 
     The first has this name, the next one the same with _2."""
-    laws = every_law((result.get("remainder") or {}).get("law"))
+    laws = every_law(result)
     if not laws:
         raise InputError(
             "this diagnosis has no law to save; one with `remainder.law` in diagnosis.json was expected"

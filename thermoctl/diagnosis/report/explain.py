@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from thermoctl.diagnosis.report import figures
-from thermoctl.diagnosis.report.words import every_law, what_next
+from thermoctl.diagnosis.report.words import what_next
 
 NOTHING = ": it promised nothing in any screening, or has not this place (`thermoctl effects` lists names)"
 SHOWN, LOST = 4, 3  # largest number of hypotheses; largest number of effects that were tried and lost
@@ -41,7 +41,7 @@ def why(result: Mapping[str, Any], asked: str) -> str:
         plain = entry.replace("_", " ")
         return spoken in (plain, plain.partition(" at ")[0])
 
-    laws = every_law((result["remainder"] or {}).get("law"))
+    laws = figures.every_law(result)
     for f in (*result["findings"], *({"effect": "law", **law} for law in laws)):
         if is_asked(name := f"{f['effect']} at {f['where']}"):
             sure, confirmed = (figures.chance(f[k]) for k in ("probability", "confirmed"))

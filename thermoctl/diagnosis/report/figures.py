@@ -161,7 +161,13 @@ def equation(finding: Result) -> str:
 
 def extends(result: Result) -> bool:
     """Return whether the result's plant has an effect or a law more than the original one."""
-    return bool(result["findings"] or (result["remainder"] or {}).get("law"))
+    return bool(result["findings"] or every_law(result))
+
+
+def every_law(result: Result) -> list[Result]:
+    """Return the law of the remainder and those beside it."""
+    law = (result.get("remainder") or {}).get("law")
+    return [law, *law.get("beside", ())] if law else []
 
 
 def error_rows(result: Result) -> Rows:

@@ -24,7 +24,7 @@ from thermoctl.files.safe_file import write_text
 from thermoctl.plant.fitting.estimate import Estimate, correlations, report
 from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.show import drawing
-from thermoctl.report.page import BLUE, figure, folded, page, panel, panels, table, unit
+from thermoctl.report.page import BLUE, figure, folded, items, page, panel, panels, paragraph, table, unit
 from thermoctl.report.residuals import titled
 
 SHOWN = 4  # largest number of further curves, those with the largest errors
@@ -40,7 +40,6 @@ def write_report(diagnosis: Diagnosis, result: Mapping[str, Any], path: str | Pa
     drawn = _ordered(curves(diagnosis), outputs(result), figures.extends(result))
     more = "".join(_compared(c, result) for c in drawn[1:])
     rest = folded(f"{len(drawn) - 1} more curves", more)
-    law = (result["remainder"] or {}).get("law")
     sections = [
         ("", _lead(result) + "".join(_compared(c, result, True) for c in drawn[:1])),
         ("What next", _next(result)),
@@ -48,7 +47,7 @@ def write_report(diagnosis: Diagnosis, result: Mapping[str, Any], path: str | Pa
             "The likeliest" if result["verdict"] == "ambiguous" else "What was found",
             _findings(diagnosis, result),
         ),
-        ("A law for what remains", law_section(diagnosis.laws, law)),
+        ("A law for what remains", law_section(diagnosis.laws, result)),
         ("How well it fits", _worth(result) + rest),
         ("The error that is left", _remains(drawn, result)),
         ("Where", _place(diagnosis, result)),
@@ -101,15 +100,7 @@ def _compared(c: Curve, result: Mapping[str, Any], first: bool = False) -> str:
 
 def _next(result: Mapping[str, Any]) -> str:
     text = f'<p class="next">{html.escape(what_next(result))}</p>'
-    return text + _experiment(result["next_experiment"]) + _items(figures.merged(result["notes"]))
-
-
-def _p(text: str) -> str:
-    return f"<p>{html.escape(text)}</p>"
-
-
-def _items(lines: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+    return text + _experiment(result["next_experiment"]) + items(figures.merged(result["notes"]))
 
 
 def _table(rows: Rows, caption: str = "") -> str:
@@ -125,7 +116,7 @@ def _findings(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
         sure = f"probability {chance(f['probability'])}; that other data confirm it {chance(f['confirmed'])}"
         kinds = ", ".join(f"{name(m)} ({chance(m['probability'])})" for m in f.get("members", ()))
         what = f"One of {kinds}, of which the plant has: {effect.title}" if kinds else effect.title
-        body += f"<h3>{html.escape(name(f))}</h3>{_p(f'{what}; {sure}.')}"
+        body += f"<h3>{html.escape(name(f))}</h3>{paragraph(f'{what}; {sure}.')}"
         body += f"<pre>{html.escape(figures.equation(f))}</pre>"
         heads, rows = figures.parameter_rows(f)
         body += _table((heads, [(*r[:2], unit(r[2])) for r in rows]))
@@ -165,7 +156,7 @@ def _remains(drawn: Sequence[Curve], result: Mapping[str, Any]) -> str:
         if m["when"]:
             spans = "; ".join(f"{a:.4g} to {b:.4g} s" for a, b in m["when"][:6])
             facts.append(f"The error of {m['channel']} is largest at {spans} of {m['recording']}.")
-    return body + _table(figures.remainder_rows(result)) + _items(facts)
+    return body + _table(figures.remainder_rows(result)) + items(facts)
 
 
 def _place(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
@@ -239,7 +230,7 @@ def _why(result: Mapping[str, Any]) -> str:
         "drift of the same size. Remainder: probability of a systematic error that stays."
     )
     return (
-        _p(f"{result['decision']['row'][:1].upper()}{result['decision']['row'][1:]}.")
+        paragraph(f"{result['decision']['row'][:1].upper()}{result['decision']['row'][1:]}.")
         + _table(figures.decision_rows(result))
         + folded(f"What lost, and why: {len(lost[1])} effects", _table(lost))
         + folded(f"Every hypothesis that was fitted: {len(every[1])}", _table(every, caption))
@@ -259,8 +250,8 @@ def _unseen(result: Mapping[str, Any]) -> str:
 def _experiment(entry: Mapping[str, Any] | None) -> str:
     if not entry:
         return ""
-    body = _p(f"{entry['profile'][:1].upper()}{entry['profile'][1:]}. {entry['why']}")
-    body += _items(peaks(entry))
+    body = paragraph(f"{entry['profile'][:1].upper()}{entry['profile'][1:]}. {entry['why']}")
+    body += items(peaks(entry))
     corners = {n: np.array(v) for n, v in entry["inputs"].items()}
     moving = {n: c for n, c in corners.items() if len(c) > 1 and np.ptp(c[:, 1]) > 0}
     if not moving:
@@ -278,7 +269,7 @@ def _made(diagnosis: Diagnosis, result: Mapping[str, Any]) -> str:
     case = diagnosis.case
     files = ", ".join(Path(t.path).name for t in case.tables)
     ended = " The budget ended the search." if result["truncated"] else ""
-    return _items(
+    return items(
         [
             f"{sum(len(t.t) for t in case.tables)} samples of {files}.",
             f"{case.budget.fits_done} refits; {len(result['hypotheses'])} hypotheses, in "

@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from thermoctl.diagnosis.report.figures import Output, Result, chance, outputs, size, with_interval
+from thermoctl.diagnosis.report.figures import Output, Result, chance, every_law, outputs, size, with_interval
 from thermoctl.diagnosis.verdict import OVERRULED
 
 NEXT = {
@@ -45,7 +45,7 @@ def words(result: Result) -> str:
 def sentences(result: Result) -> list[str]:
     """Return the findings, their worth and the remainder."""
     rows = outputs(result)
-    every = every_law(_law(result))
+    every = every_law(result)
     laws = [law_sentence(law, f"The law at {law['where']}" if every[1:] else "A law for it") for law in every]
     texts = [_found(result, rows), *_families(result), *laws]
     if rows and (result["findings"] or laws):
@@ -107,15 +107,6 @@ def listed(items: Sequence[str]) -> str:
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
 
 
-def every_law(entry: Result | None) -> list[Result]:
-    """Return the law of the remainder and those beside it; none for None."""
-    return [entry, *entry.get("beside", ())] if entry else []
-
-
-def _law(result: Result) -> Result | None:
-    return (result["remainder"] or {}).get("law")
-
-
 def law_sentence(entry: Result, head: str = "A law for it") -> str:
     """Return a sentence on a law of the remainder, which begins with `head`."""
     values = ", ".join(
@@ -172,7 +163,7 @@ def _found(result: Result, rows: Sequence[Output]) -> str:
     if named := [f for f in result["findings"] if "members" not in f]:
         names = [f"{name(f)} (probability {chance(f['probability'])})" for f in named]
         return f"Found: {listed(names)}."
-    if laws := every_law(_law(result)):
+    if laws := every_law(result):
         return f"Found: {listed([_unknown(law) for law in laws])}, which no effect of the catalogue is."
     why = next((a["why_not"] for a in result["alternatives"] if a.get("why_not")), "")
     doubted = listed([name(a) for a in result["alternatives"] if why and a.get("why_not") == why][:2])
@@ -225,7 +216,7 @@ def _doubt(alternative: Result) -> str:
 
 
 def _gain(result: Result, o: Output) -> str:
-    many = len(result["findings"]) + len(every_law(_law(result))) > 1
+    many = len(result["findings"]) + len(every_law(result)) > 1
     likely = f"With the likeliest{' ones' if many else ''}" if result["verdict"] == "ambiguous" else ""
     came = o.size("before")
     alone = f"{o.size('refit_only')} after a refit alone" + (f" ({came} as the plant came)" if came else "")
