@@ -82,6 +82,12 @@ def test_coloured_noise_alone_is_consistent_and_the_note_says_how_to_state_it(na
     assert time == pytest.approx(rows * interval, rel=0.4)
 
 
+def test_noise_correlated_over_more_than_a_twentieth_of_the_recordings_is_no_known_noise():
+    """Of 300 rows the note said 150: a twentieth of the rows is the longest time that is looked for."""
+    found = diagnose(*recorded("stage", 300, 1.5, 1), {}, limits())
+    assert not about_noise(found) and found.decision.verdict == "unexplained"
+
+
 def test_what_the_note_says_is_what_the_plant_file_needs():
     plant, tables = recorded("stage", 10, 1.5, 2)
     (note,) = about_noise(diagnose(plant, tables, {}, limits()))

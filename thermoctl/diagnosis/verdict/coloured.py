@@ -40,7 +40,11 @@ def coloured(case: Case, f: Fitted) -> list[str]:
         size, share, time = _likeliest(g, g.power(f.powers))
         least, most = g.variance * np.exp([-g.known, g.known])
         small = (1 - share) * size**2 <= least and size**2 <= most
-        if not small or time * TIMES > g.count.sum() or min(_chances(case, f, g, size, share, time)) < CHANCE:
+        if (
+            not small
+            or time >= g.count.sum() / TIMES
+            or min(_chances(case, f, g, size, share, time)) < CHANCE
+        ):
             return []
         white, drift = size * np.sqrt(1 - share), size * np.sqrt(share)
         unit = case.plant.outputs[name].unit or ""
