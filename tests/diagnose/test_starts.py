@@ -8,6 +8,9 @@ import pytest
 from tests.plants import TANK, TWO_BLOCKS
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.evidence.odds import odds
+from thermoctl.diagnosis.evidence.posterior import Placed
+from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search.beam import started
@@ -79,6 +82,24 @@ def test_recorded_inputs_take_no_share_of_the_odds_that_a_sensor_is_slow():
     table = compile_plant(loads(TWO_BLOCKS)).measure(Table("run", "run", t, columns), seed=1)
     where = places(case(loads(TWO_BLOCKS), [table], catalogue(), Budget(80)))
     assert where["sensor_lag"] == where["sensor_delay"] == {"temperature_1", "temperature_2"}
+
+
+@pytest.mark.parametrize("recordings", [1, 2, 3])
+def test_an_event_shares_the_odds_of_its_place_among_all_its_clocks(recordings):
+    """The clock that all recordings have in common kept the whole share: with the others the event had twice the odds."""
+    t = np.arange(100) * 4.0
+    columns = {"heat": np.sin(t / 50), "air_temperature": np.full(100, 21.0)}
+    model = compile_plant(loads(TWO_BLOCKS))
+    tables = [model.measure(Table(f"run_{k}", "run", t, columns), seed=k) for k in range(recordings)]
+    known = case(loads(TWO_BLOCKS), tables, {"conductance_step": catalogue()["conductance_step"]}, Budget(80))
+    where, drives = places(known), known.drives(known.null.model)
+    here = [
+        c for c in candidates(known.rig(known.plant, drives), known.catalogue) if c.place.where == "loss_1"
+    ]
+    assert len(here) == (1 if recordings == 1 else 2 * recordings)
+    sum_of_odds = sum(np.exp(odds((Placed(c, {}),), where, known.limits)) for c in here)
+    one = known.limits.missing / (1 - known.limits.missing) * known.limits.rare
+    assert sum_of_odds == pytest.approx(one / len(where["conductance_step"]))
 
 
 def test_a_loss_that_halves_while_the_plants_own_loss_imitates_it_is_found_at_its_time():

@@ -20,8 +20,7 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thres
     total = sum(e.log_odds or 0.0 for e in effects)
     for e in (e for e in effects if e.log_odds is None):
         c = e.candidate
-        share = max(len(where), 1) * len(where.get(c.effect.name, {c.place.where}))
-        share *= max(2 * len(c.begins) - 3, 1)
+        share = max(len(where), 1) * len(where.get(c.effect.name, {c.place.where})) * c.clocks
         total += np.log(limits.missing / (1 - limits.missing) / share)
         total += rare(c.effect, bool(c.place.input)) * np.log(limits.rare)
     return float(total)

@@ -39,6 +39,7 @@ class Candidate:
     symbols: Mapping[str, Expr] = field(default_factory=dict)
     label: str = ""
     begins: Mapping[str, float] = field(default_factory=dict)
+    clocks: int = 1  # number of clocks that the effect may have in these recordings
 
     @property
     def key(self) -> tuple[str, str]:

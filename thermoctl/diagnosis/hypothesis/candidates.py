@@ -59,12 +59,13 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     for effect in effects.values():
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
+        clocks = _clocks(rig, effect)
         for place, here in _placed(rig, effect):
             for variant in range(len(effect.changes)):
                 for k, choice in enumerate(_choices(rig, effect, place)):
-                    for which, begins in _clocks(rig, effect).items():
+                    for which, begins in clocks.items():
                         label = f"{variant}{k}{which}"
-                        candidate = Candidate(here, place, rig, variant, choice, label, begins)
+                        candidate = Candidate(here, place, rig, variant, choice, label, begins, len(clocks))
                         if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
                             continue  # without a held input it would equal the variant without `straight`
                         out.append(candidate)
