@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from thermoctl.diagnosis.commands import summary
 from thermoctl.diagnosis.curves import Curve
-from thermoctl.diagnosis.data.case import Budget, outlier_note
+from thermoctl.diagnosis.data.case import Budget
+from thermoctl.diagnosis.data.outliers import outlier_note
 from thermoctl.diagnosis.report.explain import explain
 from thermoctl.diagnosis.report.figures import (
     chance,

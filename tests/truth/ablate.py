@@ -196,7 +196,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "answers": Rule(
         "more outliers right after switches than by chance are answers of the plant",
-        {"data.case._without_answers": lambda odd, after: odd},
+        {"data.outliers._without_answers": lambda odd, after: odd},
         searches=True,
     ),
     "near": Rule(

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import stdtr
 
-from thermoctl.diagnosis.data.case import FAILS, Case, outlier_note, without_outliers
+from thermoctl.diagnosis.data.case import FAILS, Case
+from thermoctl.diagnosis.data.outliers import outlier_note, without_outliers
 from thermoctl.diagnosis.data.rows import means
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.plant.fitting import refit
