@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import NEXT
-from thermoctl.diagnosis.result import contract
 from thermoctl.plant import load
 from thermoctl.plant.recordings import read_recordings
 

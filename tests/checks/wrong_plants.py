@@ -14,11 +14,11 @@ from pathlib import Path
 from tests.checks.rigs import PLANTS, rig
 from tests.checks.test_checks import DAMAGES, WRONG
 from thermoctl.checks import checks
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.relabelled import relabelled
-from thermoctl.diagnosis.result import contract
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import Plant, loads
 from thermoctl.recording.table import Table

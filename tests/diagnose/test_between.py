@@ -8,13 +8,13 @@ import pytest
 
 from tests.bench.between import named
 from tests.plants import ONE_BLOCK
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import Memory
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table

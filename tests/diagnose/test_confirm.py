@@ -12,10 +12,10 @@ from scipy.stats import wilcoxon
 
 from tests.bench.scale import block_plant, recorded
 from tests.plants import WIDE_BLOCK
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.diagnosis.verdict.confirm import Confirm, confirmed, signed_rank
 from thermoctl.diagnosis.verdict.decide import Probabilities

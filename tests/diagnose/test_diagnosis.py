@@ -16,7 +16,7 @@ from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.report.explain import why
-from thermoctl.diagnosis.result import doubts
+from thermoctl.diagnosis.report.notes import doubts
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import load, loads
 from thermoctl.plant.simulation.simulate import compile_plant

@@ -11,13 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
 from tests.plants import WIDE_BLOCK
-from thermoctl.diagnosis import result
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import fitted
 from thermoctl.diagnosis.evidence.held_out import worse, worth
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report import notes
 from thermoctl.diagnosis.verdict.confirm import Confirm
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -116,10 +116,10 @@ def test_a_recording_set_aside_that_is_not_followed_is_told_where_nothing_is_mis
     volume = SimpleNamespace(per_recording=own, range=(1.0, 9.0))
     case = SimpleNamespace(plant=SimpleNamespace(parameters={"V": volume}))
     d = SimpleNamespace(worth=worth, case=case, decision=SimpleNamespace(verdict="consistent"))
-    (note,) = result._differ(d)
+    (note,) = notes._differ(d)
     assert note == f"the error of y is 3.8 times the noise in pat_5, set aside: {why}"
     worth.refit_only = {"y": 0.7}
-    assert not result._differ(d)
+    assert not notes._differ(d)
 
 
 def test_wild_readings_in_a_recording_set_aside_are_left_out_there_too():

@@ -7,12 +7,12 @@ import pytest
 
 from tests.checks.rigs import PLANTS, rig
 from thermoctl.checks import checks
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.mistakes import MISTAKES
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant

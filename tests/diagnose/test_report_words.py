@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from thermoctl.diagnosis.commands import summary
+from thermoctl.diagnosis.contract import CONTRADICTED, UNCONFIRMED
 from thermoctl.diagnosis.curves import Curve
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.data.outliers import outlier_note
@@ -24,8 +25,8 @@ from thermoctl.diagnosis.report.figures import (
     short,
     with_interval,
 )
+from thermoctl.diagnosis.report.notes import unfinished
 from thermoctl.diagnosis.report.words import name, sentences, what_next, words
-from thermoctl.diagnosis.result import CONTRADICTED, UNCONFIRMED, unfinished
 
 sizes = st.floats(-7, 5).map(lambda power: 10.0**power)
 chances = st.floats(0, 1)

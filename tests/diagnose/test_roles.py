@@ -12,13 +12,13 @@ import yaml
 from tests.diagnose.changes import Given, kelvin, milliwatt, names, order
 from tests.plants import ONE_BLOCK
 from thermoctl.cli import main
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.where import signals
 from thermoctl.diagnosis.hypothesis.candidates import Candidate, candidates
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.overlay import Overlay, Trajectory
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex

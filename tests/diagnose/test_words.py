@@ -7,9 +7,9 @@ import json
 import pytest
 
 from thermoctl.cli import main
+from thermoctl.diagnosis.contract import CONTRADICTED
 from thermoctl.diagnosis.report.explain import explain, why
 from thermoctl.diagnosis.report.words import sentences, what_next, words
-from thermoctl.diagnosis.result import CONTRADICTED
 from thermoctl.diagnosis.verdict import OVERRULED
 
 LAG = {

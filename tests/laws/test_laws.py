@@ -19,6 +19,7 @@ from tests.laws.rigs import LAWS, RELAYS, STORAGES, TANKS, make
 from tests.plants import SPRING_STAGE, TWO_BLOCKS
 from tests.proof.rigs import RIGS
 from thermoctl.cli import main
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose, sought
 from thermoctl.diagnosis.evidence.fit import Placed, fitted
@@ -44,7 +45,6 @@ from thermoctl.diagnosis.law.signals import Place, Signal, conversions, signals
 from thermoctl.diagnosis.law.smooth import Tracked, _explained, tracked
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import law_sentence
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.search.metric import Metric, Plain
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex

@@ -8,12 +8,12 @@ from scipy.signal import lfilter
 from tests.bench.laws import smoothed
 from tests.bench.published import plant_of
 from tests.laws.published import SYSTEMS
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.law.result import save_effect
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report.words import sentences
-from thermoctl.diagnosis.result import contract
 from thermoctl.plant.files import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table

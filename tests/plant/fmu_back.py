@@ -13,12 +13,12 @@ import time
 from pathlib import Path
 
 from tests.export.plants import plants, recording
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.candidates import candidates
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.hypothesis.rig import Rig
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.export.commands import write
 from thermoctl.files import yamlfile
 from thermoctl.files.yamlfile import InputError

@@ -25,8 +25,8 @@ from tests.truth.__main__ import GROUPS, cases, options, write
 from tests.truth.judge import Row, changes, figures, row
 from tests.truth.run import KEPT, kept, sought
 from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.limits import limits
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.unknown_flow import Missing
 from thermoctl.fleet.jobs import Job, outcome

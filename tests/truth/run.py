@@ -13,11 +13,11 @@ from typing import Any, cast
 
 from thermoctl import __version__
 from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.data.case import Budget
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import Thresholds, limits
 from thermoctl.diagnosis.relabelled import relabelled
-from thermoctl.diagnosis.result import contract
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.files.yamlfile import InputError
 from thermoctl.fleet.jobs import Job, Run

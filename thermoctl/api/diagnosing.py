@@ -14,6 +14,7 @@ from thermoctl.api.data import Data, tables_of
 from thermoctl.api.plants import Plant, plant_of
 from thermoctl.api.plots import over_time
 from thermoctl.checks import checks
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.diagnose import diagnose as _diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import CATALOGUE, catalogue
 from thermoctl.diagnosis.limits import limits
@@ -21,7 +22,6 @@ from thermoctl.diagnosis.relabelled import relabelled
 from thermoctl.diagnosis.report.figures import chance
 from thermoctl.diagnosis.report.words import words
 from thermoctl.diagnosis.result import Diagnosis as Found
-from thermoctl.diagnosis.result import contract
 from thermoctl.files.safe_file import whole_files, write_text
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import save

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoctl.diagnosis import diagnose as engine
+from thermoctl.diagnosis.contract import contract
 from thermoctl.diagnosis.data import memory
 from thermoctl.diagnosis.evidence.fit import remembered
 from thermoctl.diagnosis.experiment import file as experiment_file
@@ -24,7 +25,7 @@ from thermoctl.diagnosis.report.page import write_report
 from thermoctl.diagnosis.report.trend import earlier_trends, trend_notes, trends
 from thermoctl.diagnosis.report.unseen import not_seen
 from thermoctl.diagnosis.report.words import words
-from thermoctl.diagnosis.result import Diagnosis, contract
+from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.extras import lacking
 from thermoctl.files.safe_file import whole_files, write_text
