@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 from scipy.fft import dct
 
@@ -25,10 +27,8 @@ def _variances(rig) -> dict[tuple[str, str, str], np.ndarray]:
     model = compile_plant(plant)
     drives = [model.excitation(Table(k, k, c["t"], c)) for k, c in rig.recordings.items()]
     coordinates = Coordinates(drives)
-    values = np.array([model.vector(None)] * len(drives))
-    found = responses(
-        model, drives, values, np.zeros((len(drives), len(model.uncertain))), coordinates, set()
-    )
+    values, dx0 = np.array([model.vector(None)] * len(drives)), np.zeros((len(drives), len(model.uncertain)))
+    found = responses(SimpleNamespace(model=model, values=values, dx0=dx0), drives, coordinates, set())
     return {
         (drives[c.recording].name, n, model.outputs[c.output]): row
         for c, white in zip(coordinates.channels, found.white, strict=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from thermoctl.checks.hung import without_hung
@@ -10,7 +10,7 @@ from thermoctl.diagnosis.data.case import Budget, Case, case
 from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
 from thermoctl.diagnosis.evidence.between import between
-from thermoctl.diagnosis.evidence.fit import Fitted, closest, with_residuals
+from thermoctl.diagnosis.evidence.fit import closest, with_residuals
 from thermoctl.diagnosis.evidence.held_out import cleaned, split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.unknown import left, reached
@@ -18,9 +18,8 @@ from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
-from thermoctl.diagnosis.law.find import FoundLaw, found_law
+from thermoctl.diagnosis.law.find import found_laws
 from thermoctl.diagnosis.law.forms import LAW
-from thermoctl.diagnosis.law.refit import laws_of
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
@@ -28,7 +27,7 @@ from thermoctl.diagnosis.search.beam import Searched, Weighed, search, searched
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.coloured import coloured
 from thermoctl.diagnosis.verdict.confirm import Confirm, brief, confirmed, timed
-from thermoctl.diagnosis.verdict.decide import Decision, Facts, Probabilities, decide, weigh
+from thermoctl.diagnosis.verdict.decide import Facts, Probabilities, decide, weigh
 from thermoctl.diagnosis.verdict.families import families
 from thermoctl.diagnosis.verdict.misfit import deviations, energies, standing, supported
 from thermoctl.diagnosis.verdict.unknown_flow import Missing, flow_missing
@@ -161,7 +160,7 @@ def decided(sought: Sought) -> Diagnosis:
         unknown.doubt(decision.verdict, numbers),
         asked,
         families=families(posterior, physics, decision.named, known.catalogue, asked, numbers.name),
-        laws=tuple(_laws(known, tried, best, decision, posterior, asked)),
+        laws=tuple(found_laws(known, tried, best, decision.named, posterior.effects, asked)),
     )
     if decision.verdict != "consistent" and not diagnosis.shown and before.node:
         return replace(diagnosis, missing_flow=missing_flow(known, null, before.node))
@@ -201,21 +200,3 @@ def _chosen(
     # a recording set aside may know too little to confirm them; unconfirmed evidence counts less
     posterior = weigh(scores, physics, numbers.unasked)
     return (chosen if posterior.something >= numbers.name else frozenset()), posterior, {}
-
-
-def _laws(
-    known: Case,
-    tried: Mapping[Keys, Weighed],
-    best: Fitted,
-    decision: Decision,
-    posterior: Probabilities,
-    asked: Mapping[Key, float],
-) -> Iterator[FoundLaw]:
-    """Return the laws among the names, each with its gain over the best hypothesis without it."""
-    mine = best.hypothesis.keys
-    for law in laws_of(best):
-        if (key := law.key) in decision.named:
-            fewer = (w for keys, w in tried.items() if keys < mine and key not in keys)
-            without = max(fewer, key=lambda w: w.score)
-            gain, other = tried[mine].score - without.score, without.fitted
-            yield found_law(known, best, law, other, gain, posterior.effects[key], asked.get(key, 1.0))

@@ -125,11 +125,6 @@ class Case:
     outliers: Outliers = ()
     limits: Thresholds = field(default_factory=limits)  # numbers by which the diagnosis decides
 
-    @property
-    def measured(self) -> list[str]:
-        """Return the names of the outputs that `grids` are of."""
-        return [g.output for g in self.grids]
-
     def drives(self, model: Model) -> list[Excitation]:
         """Return the recordings as a model reads them.
 

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.levels import levels, over_noise
-from thermoctl.diagnosis.evidence.where import Responses, responses, signals
+from thermoctl.diagnosis.evidence.where import Responses, along, responses
 from thermoctl.diagnosis.hypothesis.rig import Rig
 
 CORRELATED, SHOWN = 0.4, 3  # reported signals: least correlation with the residual; largest number
@@ -34,8 +34,9 @@ class Left:
 
 def left(case: Case, f: Fitted, reach: Responses) -> Left:
     """Measure and locate the residual of a fitted hypothesis."""
-    over = dict(zip(case.measured, over_noise(case, f), strict=True))
-    noise = dict(zip(case.measured, levels(case, f), strict=True))
+    measured = [g.output for g in case.grids]
+    over = dict(zip(measured, over_noise(case, f), strict=True))
+    noise = dict(zip(measured, levels(case, f), strict=True))
     rms = {o: noise[o] * float(np.sqrt(max(ratio**2 - 1, 0.0))) for o, ratio in over.items()}
     worst = max(over, key=lambda o: over[o])
     follow = follows(case, f, worst) if over[worst] > 1 else ()
@@ -44,9 +45,8 @@ def left(case: Case, f: Fitted, reach: Responses) -> Left:
 
 def reached(case: Case) -> Responses:
     """Return how random forces at the nodes of the refitted original plant change its outputs."""
-    model = case.null.model
     rates = set(Rig(case.plant, [], []).pairs.values())  # positions store nothing
-    return responses(model, case.drives(model), case.null.values, case.null.dx0, case.coordinates, rates)
+    return responses(case.null, case.drives(case.null.model), case.coordinates, rates)
 
 
 def located(case: Case, f: Fitted, reach: Responses) -> list[str]:
@@ -70,9 +70,9 @@ def follows(case: Case, f: Fitted, output: str) -> tuple[str, ...]:
     The strongest is first; there are at most SHOWN."""
     model, j = f.fit.model, f.fit.model.outputs.index(output)
     products: dict[str, list[tuple[float, float, float]]] = {}
-    for r, d in enumerate(case.drives(model)):
-        values = signals(model, d, f.fit.values[r], model.run(d, f.fit.values[r], f.fit.dx0[r]).x)
-        e = f.fit.residuals[r][:, j]
+    drives = case.drives(model)
+    for d, values, errors in zip(drives, along(f.fit, drives), f.fit.residuals, strict=True):
+        e = errors[:, j]
         for name in (*model.plant.inputs, *case.plant.nodes):
             x = np.asarray(values[name], float)
             for label, signal in ((name, x), (f"change of {name}", np.gradient(x, d.t))):

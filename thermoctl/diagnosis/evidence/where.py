@@ -10,7 +10,7 @@ constant tau. Its rms is the share eta of the typical flow:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.fft import idct
 from thermoctl.diagnosis.data.coordinates import Channel, Coordinates, bands, transform
 from thermoctl.diagnosis.data.spectra import first_order
 from thermoctl.plant import expression as ex
+from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.language import Flow, Plant
 from thermoctl.plant.simulation.simulate import Excitation, Model
 
@@ -70,6 +71,12 @@ def signals(model: Model, d: Excitation, values: np.ndarray, x: np.ndarray) -> d
     }
 
 
+def along(fit: Fit, drives: Sequence[Excitation]) -> Iterator[dict[str, np.ndarray | float]]:
+    """Yield `signals` of each recording, along the fitted trajectory."""
+    for d, values, dx0 in zip(drives, fit.values, fit.dx0, strict=True):
+        yield signals(fit.model, d, values, fit.model.run(d, values, dx0).x)
+
+
 def white_forces(n: int) -> np.ndarray:
     """Return forces (n, FORCES) that contain each DCT row once, with size 1 and a fixed random sign."""
     *_, band = bands(n)
@@ -78,33 +85,26 @@ def white_forces(n: int) -> np.ndarray:
     return idct(rows, axis=0, norm="ortho")
 
 
-def responses(
-    model: Model,
-    drives: Sequence[Excitation],
-    values: np.ndarray,
-    dx0: np.ndarray,
-    coordinates: Coordinates,
-    skip: set[str],
-) -> Responses:
-    """Return the responses to forces at the nodes, for parameter values (recordings, parameters).
+def responses(fit: Fit, drives: Sequence[Excitation], coordinates: Coordinates, skip: set[str]) -> Responses:
+    """Return the responses of a fitted plant to forces at its nodes.
 
     `skip`: nodes that store nothing (a position)."""
+    model = fit.model
     nodes = tuple(
         n
         for n in model.plant.nodes
         if n not in skip and any(n in (f.source, f.target) for f in model.plant.flows.values())
     )
     white: list[np.ndarray] = []
-    trajectories = [
-        signals(model, d, values[r], model.run(d, values[r], dx0[r]).x) for r, d in enumerate(drives)
-    ]
+    trajectories = [*along(fit, drives)]
     size = [typical_flow(model.plant, n, trajectories) for n in nodes]
     for r, d in enumerate(drives):
         storages = (ex.series(model.plant.nodes[n].storage, trajectories[r], d.t) for n in nodes)
         force = white_forces(len(d.t))
         q = [force * s / storage[:, None] for s, storage in zip(size, storages, strict=True)]
         at = [(model.states.index(n), i * FORCES + k) for i, n in enumerate(nodes) for k in range(FORCES)]
-        dy = model.respond(d, values[r], dx0[r], at, np.concatenate(q, axis=1), len(at)) if at else None
+        point = fit.values[r], fit.dx0[r]
+        dy = model.respond(d, *point, at, np.concatenate(q, axis=1), len(at)) if at else None
         for c in coordinates.of_recording(r):
             power = np.zeros((len(nodes), len(c.count)))
             if dy is not None:

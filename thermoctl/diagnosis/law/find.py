@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.law.free import PIECES, SPREAD, pieces
 from thermoctl.diagnosis.law.propose import Proposal
 from thermoctl.diagnosis.law.refit import (
@@ -25,6 +26,7 @@ from thermoctl.diagnosis.law.refit import (
 )
 from thermoctl.diagnosis.law.signals import Signal
 from thermoctl.diagnosis.law.smooth import Tracked, law_unit, tracked
+from thermoctl.diagnosis.search.beam import Weighed
 from thermoctl.diagnosis.search.shortlist import HALF
 from thermoctl.plant import expression as ex
 from thermoctl.plant.fitting.cores import batches, each
@@ -91,15 +93,27 @@ class FoundLaw:
         return 1.0 - sum(share for _, _, share in self.rivals)
 
 
-def found_law(
-    case: Case, f: Fitted, law: PlacedLaw, parent: Fitted, gain: float, probability: float, confirmed: float
-) -> FoundLaw:
-    """Return the law of a hypothesis with its curve. `parent`: the hypothesis without it."""
-    p = law.proposal
-    drawn = None
-    if p.place.part == "flow":
-        drawn = curve(tracked(case, parent, [p.place.target]), p, law_rate(f, law), f.plant)
-    return FoundLaw(law, f, gain, probability, confirmed, drawn, law_unit(f.plant, p.place))
+def found_laws(
+    case: Case,
+    tried: Mapping[Keys, Weighed],
+    f: Fitted,
+    named: Collection[Key],
+    probability: Mapping[Key, float],
+    confirmed: Mapping[Key, float],
+) -> Iterator[FoundLaw]:
+    """Yield the named laws of a hypothesis, each with its gain over the best hypothesis without it.
+
+    `confirmed`: of those that were tested."""
+    mine = f.hypothesis.keys
+    for law in (law for law in laws_of(f) if law.key in named):
+        fewer = (w for keys, w in tried.items() if keys < mine and law.key not in keys)
+        without, place, drawn = max(fewer, key=lambda w: w.score), law.proposal.place, None
+        gain = tried[mine].score - without.score
+        if place.part == "flow":
+            linear = tracked(case, without.fitted, [place.target])
+            drawn = curve(linear, law.proposal, law_rate(f, law), f.plant)
+        sure = probability[law.key], confirmed.get(law.key, 1.0)
+        yield FoundLaw(law, f, gain, *sure, drawn, law_unit(f.plant, place))
 
 
 def curve(linear: Tracked, p: Proposal, rate: ex.Expr, plant: Plant) -> Curve | None:

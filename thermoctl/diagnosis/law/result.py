@@ -13,7 +13,7 @@ import yaml
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.fit import Fitted
 from thermoctl.diagnosis.evidence.held_out import Worth
-from thermoctl.diagnosis.evidence.where import signals
+from thermoctl.diagnosis.evidence.where import along
 from thermoctl.diagnosis.hypothesis.rig import zero_of
 from thermoctl.diagnosis.law.find import FoundLaw
 from thermoctl.diagnosis.law.forms import MARK
@@ -107,14 +107,14 @@ def described(p: Proposal, f: Fitted) -> str:
 
 def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
     """Return a sentence for a flow of the plant that the law only leads to, or takes from, another node."""
-    place, model, fit = law.proposal.place, law.fitted.fit.model, law.fitted.fit
+    place, model = law.proposal.place, law.fitted.fit.model
+    drives = case.drives(model)
     own, out = law_rate(law.fitted, law.placed), []
     for f in model.plant.flows.values():
         if not place.source or (f.target == place.source) == (f.source == place.target):
             continue
         moved, whole = [], []
-        for d, values, dx0 in zip(case.drives(model), fit.values, fit.dx0, strict=True):
-            names = signals(model, d, values, model.run(d, values, dx0).x)
+        for d, names in zip(drives, along(law.fitted.fit, drives), strict=True):
             moved.append(ex.series(own, names, d.t))
             whole.append(ex.series(f.rate, names, d.t))
         apart = np.concatenate(moved) - np.concatenate(whole)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from thermoctl.diagnosis.evidence.where import signals
+from thermoctl.diagnosis.evidence.where import along
 from thermoctl.diagnosis.hypothesis.rig import CORRECT, SEEN
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
@@ -48,8 +48,7 @@ def linear(fit: Fit, drives: Sequence[Excitation]) -> Linear | None:
     model, n = fit.model, len(drives)
     states, outputs = model.states, model.plant.outputs.values()
     a, c, rate = np.zeros((len(states),) * 2), np.zeros((len(outputs), len(states))), np.zeros(len(states))
-    for r, d in enumerate(drives):
-        values = signals(model, d, fit.values[r], model.run(d, fit.values[r], fit.dx0[r]).x)
+    for values in along(fit, drives):
 
         def median(e: ex.Expr, values: dict[str, np.ndarray | float] = values) -> float:
             """Return the median of an expression over time."""

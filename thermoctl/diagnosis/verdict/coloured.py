@@ -21,7 +21,7 @@ from thermoctl.diagnosis.data.coordinates import transform
 from thermoctl.diagnosis.data.grids import Grid
 from thermoctl.diagnosis.data.spectra import first_order
 from thermoctl.diagnosis.evidence.fit import Fitted
-from thermoctl.diagnosis.evidence.where import signals
+from thermoctl.diagnosis.evidence.where import along
 
 SHARES = 1 - np.array([0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9])  # a
 TIMES = 20  # correlation times in all recordings together, at least: of fewer, no spectrum is known
@@ -33,7 +33,7 @@ LAGS = (0, 1, 2, 4, 8, 16, 32, 64)  # rows by which a signal may be earlier
 def coloured(case: Case, f: Fitted) -> list[str]:
     """Return a sentence for each output with a certain remainder; none if one is not its noise alone."""
     out = []
-    for name, g, p in zip(case.measured, case.grids, f.average.remainder, strict=True):
+    for g, p in zip(case.grids, f.average.remainder, strict=True):
         if p < case.limits.name:
             continue
         interval = case.coordinates.channels[g.channels[0]].interval
@@ -47,9 +47,9 @@ def coloured(case: Case, f: Fitted) -> list[str]:
         ):
             return []
         white, drift = size * np.sqrt(1 - share), size * np.sqrt(share)
-        unit = case.plant.outputs[name].unit or ""
+        unit = case.plant.outputs[g.output].unit or ""
         out.append(
-            f"the noise of {name} is coloured: {size:.2g} {unit}, correlated over {time * interval:.2g} s ({time:.2g} rows). State "
+            f"the noise of {g.output} is coloured: {size:.2g} {unit}, correlated over {time * interval:.2g} s ({time:.2g} rows). State "
             f"it in the plant file, noise: {{white: {white:.2g}, drift: {drift:.2g}, time: {time * interval:.2g}}}, and diagnose again"
         )
     return out
@@ -69,14 +69,13 @@ def _likeliest(g: Grid, power: np.ndarray) -> tuple[float, float, float]:
 
 def _chances(case: Case, f: Fitted, g: Grid, size: float, share: float, time: float) -> Iterator[float]:
     """Yield the chance of residuals that follow the signals as well (F test), and of parts as large."""
-    drives, model = case.drives(f.fit.model), f.fit.model
+    names = [*along(f.fit, case.drives(f.fit.model))]
     residuals, others = [], []
     for c in (case.coordinates.channels[k] for k in g.channels):
         r, rows = c.recording, np.arange(c.rows)
         root = size * np.sqrt(1 - share + share * first_order(time, np.pi * (rows + 0.5) / c.rows))
-        e, run = f.fit.residuals[r], model.run(drives[r], f.fit.values[r], f.fit.dx0[r])
-        of = [*signals(model, drives[r], f.fit.values[r], run.x).values()]
-        moving = [x - np.mean(x) for x in of if np.ndim(x) and np.ptp(x) > 0]
+        e = f.fit.residuals[r]
+        moving = [x - np.mean(x) for x in names[r].values() if np.ndim(x) and np.ptp(x) > 0]
         beside = [np.nan_to_num(e[:, j]) for j in range(e.shape[1]) if j != c.output]
         every = [*moving, *(x**2 for x in moving), *(x * np.abs(x) for x in moving), *beside]
         late = [np.append(np.full(lag, x[0]), x)[: len(x)] for x in every for lag in LAGS]
@@ -88,7 +87,7 @@ def _chances(case: Case, f: Fitted, g: Grid, size: float, share: float, time: fl
     if 2 * x.shape[1] > len(z):
         yield 0.0  # too few rows to tell
         return
-    along, sizes, _ = np.linalg.svd(x / np.linalg.norm(x, axis=0), full_matrices=False)
-    along = along[:, sizes > 1e-3 * sizes[0]]
-    followed, n = float(np.sum((along.T @ z) ** 2)), along.shape[1]
+    shapes, sizes, _ = np.linalg.svd(x / np.linalg.norm(x, axis=0), full_matrices=False)
+    shapes = shapes[:, sizes > 1e-3 * sizes[0]]
+    followed, n = float(np.sum((shapes.T @ z) ** 2)), shapes.shape[1]
     yield float(fdtrc(n, len(z) - n, followed / n / ((z @ z - followed) / (len(z) - n))))
