@@ -58,14 +58,19 @@ def read_table(path: str | Path | Table, columns: Iterable[str] | None = None) -
     want = None if columns is None else list(dict.fromkeys(columns))
     try:
         return checked(path, reader(path, want))
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
-    except pa.ArrowException as e:
-        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
+    except (OSError, pa.ArrowException) as e:
+        raise unreadable(path, e) from None
     except UnicodeDecodeError:
         raise InputError(
             f"{path}: not a whole {path.suffix[1:]} file: a name of a column is not text"
         ) from None
+
+
+def unreadable(path: Path, e: Exception) -> InputError:
+    """Return the error for a file that cannot be read. Arrow's own OSErrors have no number."""
+    if isinstance(e, OSError) and e.errno is not None:
+        return InputError(f"{path}: cannot be read: {e.strerror}")
+    return InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}")
 
 
 def write_table(path: str | Path, table: Table) -> None:
@@ -327,21 +332,24 @@ def _read_parquet(path: Path, want: list[str] | None) -> Raw:
 
 
 def _read_arrow(path: Path, want: list[str] | None) -> Raw:
+    return _from_arrow(path, arrow_of(path, want), want)
+
+
+def arrow_of(path: Path, want: list[str] | None = None) -> pa.Table:
     """Return an IPC file, or an IPC stream up to where it was cut (a recorder that lost power leaves one)."""
     with pa.memory_map(str(path)) as source:
         if source.size() >= 6 and source.read(6) == b"ARROW1":
             with pa.ipc.open_file(source) as f:
                 rows = sum(f.get_batch(i).num_rows for i in range(f.num_record_batches))
                 _limit(path, rows, len(picked(path, f.schema.names, want)))
-                return _from_arrow(path, f.read_all(), want)
+                return f.read_all()
     stream = open_stream(path, want and [*want, "t", "t_s"])
     batches, rows = [], 0
     for batch in stream:
         rows += batch.num_rows
         _limit(path, rows, batch.num_columns)
         batches.append(batch)
-    schema = stream.schema
-    return _from_arrow(path, pa.Table.from_batches(batches, schema), want)
+    return pa.Table.from_batches(batches, stream.schema)
 
 
 READERS: dict[str, Callable[[Path, list[str] | None], Raw]] = {

@@ -230,7 +230,8 @@ def _judged(sheet: Sheet, columns: tuple[str, ...], seconds: Seconds, position: 
     seconds = clock.of_one_year(seconds)
     by_name = max(named(c) for c in columns) if len(columns) > 1 else named(name)
     running, runs = _run(seconds.t)
-    generic = position == 0 and is_generic(name) and len(sheet.columns) > 1
+    first = next(iter(sheet.columns))  # X_Value stands again before each channel of a clock of its own
+    generic = is_generic(first) and name.partition("\0")[0] == first and len(sheet.columns) > 1
     steps = np.diff(seconds.t[np.isfinite(seconds.t)])
     counter = kind == "bare" and len(steps) > 0 and bool(np.all(steps == COUNTER))
     with_x = name.strip().lower().startswith("x") and sheet.step_s is None

@@ -82,7 +82,7 @@ def readings(name: str, values: np.ndarray, notes: list[str]) -> np.ndarray:
     """Return numbers (N,) without those by which SCPI says that there is no reading; note them."""
     if not has_no_readings({name: values}):
         return values
-    none = (np.abs(values) >= _NO_READING) & np.isfinite(values)
+    none = np.abs(values) >= _NO_READING
     notes.append(f"'{name}': {int(none.sum())} numbers of 9.9e37 and more read as no value")
     return np.where(none, np.nan, values)
 

@@ -36,6 +36,8 @@ _PATTERN = rf"^(?:{_DATE}(?:[T ,;]\s*|$))?(?:{_CLOCK})?$"
 _SPELLINGS = tuple(
     (pattern.replace("{L}", _LETTER), by)
     for pattern, by in (
+        ("[\u00a0\u2009\u202f]", " "),
+        (r"(\d{4})\s\([A-Z][\w ]+\)$", r"\1"),  # GMT+0100 (Central European Time) of JavaScript
         (r"^(?:(?i:mon|tue|wed|thu|fri|sat|sun|mo|di|mi|do|fr|sa|so){L}*\.?,?\s+)(\d|{L})", r"\1"),
         (r"^(\d\S*[T ]\d{1,2}:\d{2}(?::[\d.]+)?Z?)(?:/| - )\d.*$", r"\1"),  # from one time to another
         (r"([ap])\.\s?m\.", r"\1m"),
@@ -125,7 +127,8 @@ def summer_time(seconds: Seconds) -> Seconds:
     steps = np.diff(seconds.t)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
     t, notes = seconds.t.copy(), [seconds.note]
-    for k in np.flatnonzero(np.abs(np.abs(steps - usual) - HOUR_S) <= max(0.1 * usual, 1.0)):
+    near = max(0.1 * min(usual, HOUR_S), 1.0)
+    for k in np.flatnonzero(np.abs(np.abs(steps - usual) - HOUR_S) <= near):
         before = later(seconds.start, float(seconds.t[k]))
         day = np.datetime64(before[:10])
         sunday = int(day.astype(int) - 3) % 7 == 0  # 1970-01-04 was one
@@ -211,7 +214,7 @@ def tidied(texts: pa.Array) -> pa.Array:
 def is_time(cell: str) -> bool:
     """Return whether a cell is a date, a time of day, both, or a duration of days and a time."""
     text = cell.strip(" \t\"'\u00a0")
-    if not _MAYBE.search(text) or len(text) > 64:
+    if not _MAYBE.search(text) or len(text) > 99:
         return False
     for pattern, by in _ONE_SPELLINGS:
         text = pattern.sub(by, text)
@@ -348,10 +351,9 @@ def from_texts(texts: pa.Array) -> Seconds:
         raise ClockError(int(np.argmin(dated)), "a time without a date among dates")
     points = pc.match_substring_regex(tidy, r"^\d+\.\d+\.")[0].as_py()
     ns, order = _dated(field, clock, points)
-    timed = bool(pc.any(pc.not_equal(field["h"], "")).as_py())
     zone = field["z"][0].as_py()
     seconds = _since(
-        ns, order, bool(zone) and (zone[0] in "+-" or zone.lower() in ("z", "utc", "gmt")), timed
+        ns, order, bool(zone) and (zone[0] in "+-" or zone.lower() in ("z", "utc", "gmt")), bool(clock.any())
     )
     if zone and zone.lower() not in ("z", "utc", "gmt") and zone[0] not in "+-":
         seconds = replace(seconds, note=f"{seconds.note} (zone {zone})")
@@ -379,8 +381,8 @@ def _iso(texts: pa.Array) -> Seconds | None:
             continue
         if ns.null_count:
             return None
-        timed = bool(pc.any(pc.match_substring(texts, ":")).as_py())
-        return _since(ns.to_numpy(zero_copy_only=False), "year-month-day", zone is not None, timed)
+        ns = ns.to_numpy(zero_copy_only=False)
+        return _since(ns, "year-month-day", zone is not None, bool(np.any(ns % DAY_NS)))
     return None
 
 

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 
 from thermoctl.files.yamlfile import InputError
@@ -292,12 +292,16 @@ def _all_commas(sample: list[tuple[int, str]]) -> bool:
 def _tail(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     """Return the rows that are data most likely: the later half, of a few all but the first.
 
-    Where the file states the end of its header, all below it."""
+    Where the file states the end of its header, all below it. Of these, the last ones of one width."""
     for n, cells in rows:
         if match := _HEADER_END.match(" ".join(cells)):
             names = int(match[1] or n + 1)
             rows = [r for r in rows if r[0] > names] or rows
-    return rows[len(rows) // 2 if len(rows) > FEW else 1 :] or rows
+    tail = rows[len(rows) // 2 if len(rows) > FEW else 1 :] or rows
+    widths = Counter(len(c) for _, c in reversed(tail))  # the last of equal ones
+    width = len(tail[-1][1])
+    block = list(takewhile(lambda r: len(r[1]) == width, reversed(tail)))[::-1]
+    return block if len(block) > 1 and width == widths.most_common(1)[0][0] else tail
 
 
 def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
@@ -305,7 +309,7 @@ def _begin(rows: list[tuple[int, list[str]]], width: int) -> int:
     tail = [c for _, c in _tail(rows) if len(c) == width]
     kinds = []
     for i in range(width):
-        seen = Counter(k for c in tail if (k := _kind(c[i])) != "-")
+        seen = Counter(k for c in reversed(tail) if (k := _kind(c[i])) != "-")  # the last of equal ones
         kinds.append(seen.most_common(1)[0][0] if seen else "-")
     expected = [i for i, k in enumerate(kinds) if k in "nt"]
 
@@ -475,6 +479,8 @@ def _header_lines(
 ) -> list[tuple[int, list[str]]]:
     """Return the lines that can be the header, with those of units below it; none without a header."""
     fitting = [(n, c) for n, c in head if _fits(c, width, data)]
+    if traced := [f for f in fitting if f[1][0] == "TraceName"]:
+        return traced  # Yokogawa: above its units and rates
     lines_of = ([f for f in fitting if len(f[1]) > 1] or fitting)[-HEAD_LINES:]  # a lone word is a title
     parted = bool(lines_of) and lines_of[-1][0] != head[-1][0] and len(head[-1][1]) > 1
     stated = [c for _, c in fitting if len(list(filter(None, c))) == 2 and is_number(c[1])]
@@ -524,8 +530,8 @@ def _fits(cells: list[str], width: int, data: list[list[str]]) -> bool:
         filled -= 1
     if filled < 2 and width > 2:
         return False
-    if 2 * sum(bool(_DECIMALS.match(c)) for c in cells) > filled:
-        return False  # a row of values above the table (EnergyPlus)
+    if 2 * sum(bool(_DECIMALS.match(c)) or is_time(c) for c in cells) > filled:
+        return False  # a row of values or dates above the table (EnergyPlus, Yokogawa)
     more = {c.lower() for c in cells[width:]}
     known_more = len(cells) > width and (
         more <= {"start", "increment", "comment", ""} or all(is_number(c) or not c for c in more)

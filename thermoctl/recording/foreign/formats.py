@@ -203,7 +203,9 @@ def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
 def _cell(value: object) -> str:
     if isinstance(value, timedelta):
         return f"{value.days} days {timedelta(seconds=value.seconds)}.{value.microseconds:06d}"
-    return value.isoformat() if isinstance(value, date | time) else "" if value is None else str(value)
+    if isinstance(value, date | time):
+        return value.isoformat()
+    return "" if value is None else str(value).replace("\n", " ")
 
 
 def _loaded(path: Path) -> dict[str, Any]:
@@ -364,6 +366,8 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
     for name, column, kind in zip(distinct(arrow.column_names), arrow.columns, arrow.schema, strict=True):
         column = column.combine_chunks()
         column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+        if pa.types.is_date(column.type):
+            column = column.cast(pa.timestamp("s"))
         if pa.types.is_timestamp(column.type):
             values: Cells = column.cast(pa.timestamp("ns", column.type.tz)).to_numpy(zero_copy_only=False)
         elif pa.types.is_duration(column.type):
@@ -371,7 +375,6 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
         elif (
             pa.types.is_string(column.type)
             or pa.types.is_large_string(column.type)
-            or pa.types.is_date(column.type)
             or pa.types.is_time(column.type)
         ):
             values = pc.fill_null(column.cast(pa.string()), "")

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from thermoctl.extras import load
 from thermoctl.files.yamlfile import InputError, suggest
+from thermoctl.recording.foreign import clock
 from thermoctl.recording.foreign.sheet import Cells, Sheet, as_cells, place_in
-from thermoctl.recording.foreign.units import spelled
+from thermoctl.recording.foreign.units import spelled, time_unit
+from thermoctl.units import SECONDS
 
 _NONE = b"N."  # None as PyTables pickles it
 
@@ -28,7 +31,7 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
             return
         if re.fullmatch(r"axis0|block\d+_items", name) or "_i_" in place:  # names of a data frame; an index
             return
-        columns = _columns(name, item)
+        columns = {n: _converted(c, item.attrs) for n, c in _columns(name, item).items()}
         own = above if item.dtype.names is None else place
         sheet = sheets.setdefault((own or "/", len(item)), Sheet({}, place_in(path), name=own or "/"))
         sheet.columns |= columns
@@ -40,7 +43,7 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
     try:
         with h5py.File(path) as file:
             file.visititems(add)
-    except (OSError, RuntimeError, ValueError, TypeError) as e:
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError) as e:
         raise InputError(f"{path}: not a whole HDF5 file: {str(e).splitlines()[0]}") from None
     names = list(dict.fromkeys(s.name for s in sheets.values()))
     if group is not None and group not in names:
@@ -52,6 +55,23 @@ def read_hdf(path: Path, notes: list[str], group: str | None = None) -> list[She
             f"'{chosen[0].name}' read, {len(chosen[0])} rows, of {', '.join(names)} (another: --sheet GROUP)"
         )
     return chosen[:1]
+
+
+def _converted(cells: Cells, said: Any) -> Cells:
+    """Return what packed numbers of netCDF stand for, and the dates of times such as `hours since` one."""
+    if not isinstance(cells, np.ndarray) or cells.dtype.kind != "f":
+        return cells
+    for none in (said[key] for key in ("_FillValue", "missing_value") if key in said):
+        cells = np.where(cells == np.ravel(none)[0], np.nan, cells)
+    if {"scale_factor", "add_offset"} & set(said):
+        scale, offset = (np.ravel(said.get(k, d))[0] for k, d in (("scale_factor", 1.0), ("add_offset", 0.0)))
+        cells = cells * float(scale) + float(offset)
+    unit, since, date = _text(said.get("units", "")).partition(" since ")
+    step = time_unit(unit)
+    if not since or step is None or not np.isfinite(cells).all() or not clock.is_time(date):
+        return cells
+    begin = np.datetime64(str(clock.from_texts(pa.array([date])).start).rstrip("Z"))
+    return np.asarray(begin + np.round(cells * SECONDS[step] * 1e6).astype("timedelta64[us]"))
 
 
 def _text(value: Any) -> str:

@@ -184,7 +184,7 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     if not times:
         return None
     if len(times) == 1:
-        times = {n: _of_one_day(c, sheet.notes) for n, c in times.items()}
+        times = {n: _of_one_day(sheet, c) for n, c in times.items()}
     units = {n: c for n, c in rest.items() if states_unit_of(n, "") and not isinstance(c, np.ndarray)}
     if tags and identity.startswith("_"):
         ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
@@ -202,14 +202,19 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     return sheets or None
 
 
-def _of_one_day(cells: Any, notes: list[str]) -> Any:
-    """Return times of day, which have no date, as durations from the first of all signals."""
+def _of_one_day(sheet: Sheet, cells: Any) -> Any:
+    """Return times of day, which have no date, as durations from the first of all signals.
+
+    Raises InputError."""
     if isinstance(cells, np.ndarray) or not clock.are_times(cells):
         return cells
-    seconds = clock.from_texts(cells)
+    try:
+        seconds = clock.from_texts(cells)
+    except clock.ClockError as e:
+        raise InputError(f"{sheet.place(e.row)}: {e.reason}") from None
     if seconds.kind != "time of day":
         return cells
-    notes.append(seconds.note)
+    sheet.notes.append(seconds.note)
     return np.round(seconds.t * 1e9).astype("timedelta64[ns]")
 
 

@@ -56,20 +56,18 @@ def read_recording(
                     )
                     return _renamed(table, columns or {})
             except InputError:
-                if path.is_dir() or path.suffix.lower() not in _TEXT:
+                if path.is_dir() or path.suffix.lower() not in _FOREIGN:
                     raise
         notes: list[str] = []
         sheets = sheets_of(path, said, notes)
         table = table_of(path, sheets, said, notes)
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read: {e.strerror or e}") from None
-    except pa.ArrowException as e:
-        raise InputError(f"{path}: not a whole {path.suffix[1:]} file: {str(e).splitlines()[0]}") from None
+    except (OSError, pa.ArrowException) as e:
+        raise files.unreadable(path, e) from None
     return _renamed(table, columns or {})
 
 
 EPOCH_S = 1e8  # three years: larger times are milliseconds of an epoch, or seconds of one with its date
-_TEXT = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", "")
+_FOREIGN = (".csv", ".arrow", ".feather")  # files that may be another program's though they look like ours
 
 
 def options(args: argparse.Namespace) -> dict[str, Any]:

@@ -51,6 +51,8 @@ _FRAMES = re.compile(
     rb"(?mi)^(base (hex|dec) +timestamps|;\$FILEVERSION=|\s*(\([-\d.: ]+\)\s+\S+|[vxsl]*can\d+)\s+[0-9A-F]{3,8}(#|\s+\[\d+\]))"
 )
 _QUOTED = re.compile(rb'^"([^"\n]*[,;\t][^"\n]*[,;\t][^"\n]*)"\r?$', re.MULTILINE)  # a row that is one cell
+# A cell of several lines, as the header of a table that was made in Excel has them.
+_BROKEN = re.compile(rb'(?m)(?:^|(?<=[,;\t]))"[^",;\t]*\n[^",;\t]*"(?=[,;\t\r\n])')
 # The header of a segment of LVM, with the line of names below it.
 _SEGMENT = re.compile(rb"(?ms)^Channels\t.*?^\*{3}End_of_Header\*{3}[^\n]*\n[^\n]*\n")
 _ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and seconds
@@ -123,7 +125,10 @@ def _of_names(sheet: Sheet) -> Sheet:
 
 
 def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
-    table = files.read_table(path)
+    try:
+        table = files.read_table(path)
+    except InputError:  # another program's
+        return [formats.read_arrow(path, files.arrow_of(path))]
     return [Sheet({"t": table.t, **table.columns}, place_in(path), meta=table.meta)]
 
 
@@ -179,7 +184,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise _frames(path)
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
-    text = _one_header(text, notes)
+    text = _one_header(_with_whole_cells(text), notes)
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
         notes.append("whole lines stand in quotes; read without them")
@@ -207,6 +212,12 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     stated = _stated(sheet, dialect)
     stated[0].again = closely  # reading cell by cell gives an error with the line
     return stated
+
+
+def _with_whole_cells(text: bytes) -> bytes:
+    """Return a text whose first cells have one line each; empty lines before it keep the numbers of lines."""
+    head = _BROKEN.sub(lambda m: re.sub(rb"\s*\n\s*", b" ", m[0]), text[:HEAD])
+    return b"\n" * (text[:HEAD].count(b"\n") - head.count(b"\n")) + head + text[HEAD:]
 
 
 def _one_header(text: bytes, notes: list[str]) -> bytes:

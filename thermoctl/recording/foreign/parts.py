@@ -16,6 +16,11 @@ from thermoctl.recording.foreign.sheet import Cells, Sheet
 from thermoctl.recording.foreign.units import NO_NAME, named, unit_of_time
 
 _FRACTIONS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_FRACTION_NAMES = {  # unit of a column, and words of its name
+    "milliseconds": ("ms", re.compile(r"(?i)\bm(illi)?s(ec)?|milli")),
+    "microseconds": ("us", re.compile(r"(?i)(\b|_)(micro|[uµ])s(ec(ond)?s?)?$")),
+    "nanoseconds": ("ns", re.compile(r"(?i)(\b|_)n(ano)?s(ec(ond)?s?)?$")),
+}
 # A column without a name is the fraction of whole seconds if it makes the steps' spread EVENER times as
 # large, in ENOUGH rows. Real fractions: 0.37. Of 4000 random signals in 20 rows at most 0.1 % do it by
 # chance.
@@ -143,6 +148,7 @@ def _date_and_time(sheet: Sheet, date: str, of_day: str, read: dict[str, Seconds
         else:
             days = pa.array([f"{v:.0f}" for v in days.tolist()])
             days = pc.replace_substring_regex(days, r"^(\d{4})(\d\d)(\d\d)$", r"\1-\2-\3")
+    days = pc.replace_substring_regex(days, r"[T ]0?0:00.*$", "")  # the midnight of Excel and of databases
     try:
         joined = clock.from_texts(pc.binary_join_element_wise(days, hours, " "))
         if NO_NAME.match(of_day) and not clock.is_even(joined.t):
@@ -161,17 +167,16 @@ def _fraction(sheet: Sheet, name: str, t: np.ndarray) -> tuple[np.ndarray, str] 
         return None
     if not np.isfinite(values).all() or values.min() < 0 or np.any(values % 1) or np.any(t % 1):
         return None
-    unit = next((u for u, size in _FRACTIONS.items() if values.max() < size), None)
+    stated = unit_of_time(name, sheet.units.get(name))
+    is_named = [u for u, (short, words) in _FRACTION_NAMES.items() if stated == short or words.search(name)]
+    unit = next((u for u in is_named or _FRACTIONS if values.max() < _FRACTIONS[u]), None)
     if unit is None:
         return None
     part = values / _FRACTIONS[unit]
-    is_named = unit_of_time(name, sheet.units.get(name)) == "ms" or re.search(
-        r"(?i)\bm(illi)?s(ec)?|milli", name
-    )
     # A signal that has nothing to do with the time adds its own spread to that of the steps.
     steps, finer = np.diff(t), np.diff(t + part)
     is_even = len(t) >= ENOUGH and finer.min() > 0 and _spread(finer) < EVENER * _spread(steps)
-    return (part, unit) if is_even or (is_named and unit == "milliseconds") else None
+    return (part, unit) if is_even or is_named else None
 
 
 def _spread(steps: np.ndarray) -> float:

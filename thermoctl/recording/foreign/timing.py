@@ -204,13 +204,7 @@ def _timed(path: Path, sheet: Sheet, how: How) -> list[Table]:
                     notes.append(f"another time left out: {_plain(name)}")
             elif name in final:
                 values[final[name]] = column
-        t, values, place = _rows(path, sheet, t, values, len(several) > 1, how, notes)
-        for name, column in values.items():
-            if np.isinf(column).any():
-                raise InputError(
-                    f"{place(int(np.isinf(column).argmax()))}: column '{name}': an infinite value; a finite number was "
-                    "expected (leave the cell empty where a sample is missing)"
-                )
+        t, values = _rows(path, sheet, t, values, len(several) > 1, how, notes)
         units = {final[n]: u for n, u in sheet.units.items() if final.get(n) in values}
         start = timer.seconds.start or sheet.start
         if timer.seconds.start and len(t) and t[0] != 0:
@@ -340,7 +334,7 @@ def _rows(
     several: bool,
     how: How,
     notes: list[str],
-) -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return times and values in the order of time. Raises InputError for missing, equal or earlier times."""
     rows = np.arange(len(t))
     missing = ~np.isfinite(t)
@@ -361,7 +355,7 @@ def _rows(
         t, values = _distinct(sheet, t, values, rows, how, notes)
     if several is False and len(t) and sheet.clock is None and how.run not in (None, 1):
         t = t - t[0]
-    return t, values, lambda row: sheet.place(int(rows[min(row, len(rows) - 1)]))
+    return t, values
 
 
 def _one_run(sheet: Sheet, t: np.ndarray, rows: np.ndarray, how: How, notes: list[str]) -> np.ndarray:

@@ -101,7 +101,8 @@ def split_words(header: str) -> tuple[str, str | None]:
     )
     if match := _LAST.match(text):
         name, unit = match[1] or match[4], match[2] or match[3] or match[5]
-        return (text, None) if re.search(r"\bin$", name) else (name, spelled(unit, name))
+        name = re.sub(r"\s+in$", "", name)  # `Temperatur in °C`
+        return (text, None) if name == "in" else (name, spelled(unit, name))
     name, unit = split_unit(text)
     if (
         unit is None

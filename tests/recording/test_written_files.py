@@ -1,0 +1,146 @@
+"""Files as tools write them: a small input of our own for each habit, compared with the numbers that it holds."""
+
+import datetime
+import warnings
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from tests.recording.test_field import ISO, read, table
+from thermoctl.files.yamlfile import InputError
+from thermoctl.recording.foreign.logger import read_recording
+
+DATES = "2026/03/01 10:00:0"
+GL840 = [
+    "Vendor,GRAPHTEC", "Model,GL840", "Version,1.22", "Sampling interval,1s", "Total data points,3", "Amp settings",
+    "CH,Signal name,Input,Range", 'CH1,"Oven","TEMP","TC_K"', 'CH2,"Room","TEMP","TC_K"', "Logic/Pulse,Off", "Data",
+    "Number,Date&Time,ms,CH1,CH2,Alarm1-10,AlarmOut", "NO.,Time,ms,degC,degC,A1234567890,A1234",
+    *(f"{k + 1},{DATES}{k},000,+  2{k}.5,{w},LLLLLLLLLL,LLLL" for k, w in enumerate(("+ 21.0", "BURNOUT", "+ 21.2"))),
+]  # fmt: skip
+DL850 = [
+    '"Model","DL850E"', '"BlockNumber","1"', '"TraceName","A","B"', '"BlockSize","3","3"', '"VUnit","V","C"',
+    '"SampleRate","2.0E+00","2.0E+00"', '"HResolution","5.0E-01","5.0E-01"', '"HOffset","0.0E+00","0.0E+00"', '"HUnit","s","s"',
+    '"Date","2026/03/01","2026/03/01"', '"Time","10:00:00.00","10:00:00.00"', "", *(f",0.{k + 1},2{k}.5," for k in range(6)),
+]  # fmt: skip
+CATMAN = [
+    "HBM_CATMAN_DATAFILE_40", "Number of channels:\t3", "Comment:\ttest", "", "Zeit  1 - Standardmessrate\tA\tB", "s\tV\t°C",
+    "T0 = 01.03.2026 10:00:00\tCH=1\tCH=2", "0\t0,1\t20,5", "0,5\t0,2\t21,5", "1\t0,3\t22,5",
+]  # fmt: skip
+DX = [
+    "DAQSTANDARD,R8.11", "Date,Time,Sampling,A,B", "YYYY/MM/DD,HH:MM:SS,mmm,,", " , , ,V,degC",
+    *(f"2026/03/01,10:00:0{k},000,0.{k + 1},2{k}.5" for k in range(3)),
+]  # fmt: skip
+JS = "Sun Mar 01 2026 10:00:0{} GMT+0100 (Central European Standard Time)"
+AB = ([0.1, 0.2, 0.3], [20.5, 21.5, 22.5])
+FILES = {  # a text, its times, columns
+    "a long header above few rows": (GL840, [0, 1, 2], {"CH1": AB[1], "CH2": [21, np.nan, 21.2]}),
+    "names above their units, rates and dates": (DL850, np.arange(6) / 2, {"A": np.arange(1, 7) / 10, "B": 20.5 + np.arange(6)}),
+    "a line between the units and as many rows": (CATMAN, [0, 0.5, 1], {"A": AB[0], "B": AB[1]}),
+    "the form of date and time below the names": (DX, [0, 1, 2], {"A": AB[0], "B": AB[1]}),
+    "a clock before each channel": (
+        ["X_Value\tA\tX_Value\tB\tComment", "0,0\t1\t0,0\t5", "0,1\t2\t0,2\t6", "0,2\t3\t0,4\t7"],
+        [0, 0.1, 0.2, 0.4], {"A": [1, 2, 3, np.nan], "B": [5, np.nan, 6, 7]},
+    ),
+    "a cell of two lines": (['"Time\n(s)","T\n(°C)"', "0,20.5", "0.5,21.5", "1,22.5"], [0, 0.5, 1], {"T": AB[1]}),
+    "seconds and nanoseconds by name": (
+        ["stamp.sec,stamp.nanosec,T", "1678788000,900000000,20.5", "1678788001,100000000,21.5", "1678788001,300000000,22.5"],
+        [0, 0.2, 0.4], {"T": AB[1]},
+    ),
+    "a date with midnight, and a time of day": (
+        ["Date,Time,T", "2026-03-01 00:00:00,23:59:59,20.5", "2026-03-02 00:00:00,00:00:00,21.5", "2026-03-05 00:00:00,00:00:00,22.5"],
+        [0, 1, 3 * 86400 + 1], {"T": AB[1]},
+    ),
+    "a date of JavaScript": (["time,T", *(f'"{JS.format(k)}",2{k}.5' for k in range(3))], [0, 1, 2], {"T": AB[1]}),
+    "a narrow blank before AM": (["time,T", "3/14/2026 11:59:59\u202fAM,20.5", "3/14/2026 12:00:00\u202fPM,21.5"], [0, 1], {"T": AB[1][:2]}),
+    "infinite for no value": (["time,T,P", "0,INF,1", "1,21,-inf", "2,22,+Inf"], [0, 1, 2], {"T": [np.nan, 21, 22], "P": [1, np.nan, np.nan]}),
+    "words out of range": (["time,T,P", "0,Open TC,1", "1,21,Under Range", "2,22,3"], [0, 1, 2], {"T": [np.nan, 21, 22], "P": [1, np.nan, 3]}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lines, t, columns", FILES.values(), ids=FILES)
+def test_the_numbers_of_a_text(tmp_path, lines, t, columns):
+    found = read(tmp_path, table(*lines))
+    np.testing.assert_allclose(found.t, t, atol=1e-6)
+    for name, values in columns.items():
+        np.testing.assert_allclose(found.columns[name], values, err_msg=name)
+
+
+def test_units_of_these_texts(tmp_path):
+    """A file in which they are lost is compared in the plant's unit, whatever its own."""
+    assert [read(tmp_path, table(*f)).units for f in (DL850, CATMAN, DX)] == 3 * [{"A": "V", "B": "degC"}]
+    found = read(tmp_path, table("Zeit in s\tTemperatur in °F\tin °C", "0\t70,5\t1", "1\t71,5\t2"))
+    assert found.units == {"Temperatur": "degF"} and list(found.columns) == ["Temperatur", "in °C"]
+
+
+def test_dates_and_times_of_excel_in_two_columns(tmp_path):
+    """The days of such a table were lost: two days later was a minute later."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book, day = openpyxl.Workbook(), datetime.date(2026, 3, 1)
+    rows = [(day, datetime.time(10), 20.5), (day + datetime.timedelta(2), datetime.time(10, 1), 21.5)]
+    for row in (["Date", "Time", "T, Oven\n(°C)"], *rows):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    found = read_recording(tmp_path / "run.xlsx")
+    assert found.t.tolist() == [0, 2 * 86400 + 60] and found.meta["start"].startswith("2026-03-01T10:00")
+    assert found.units == {"T, Oven": "degC"}
+
+
+@pytest.mark.parametrize("suffix", [".feather", ".arrow"])
+def test_arrow_files_of_other_programs(tmp_path, suffix):
+    stamps = pa.array([datetime.datetime(2026, 3, 1, 10, 0, k) for k in range(3)])
+    days = pa.array([datetime.date(2026, 3, 1 + k) for k in range(3)])
+    for times, step in ((stamps, 1), (days, 86400)):
+        arrow = pa.table({"time": times, "T [°C]": AB[1], "on": [True, False, True]})
+        with pa.OSFile(str(tmp_path / f"run{suffix}"), "wb") as f, pa.ipc.new_file(f, arrow.schema) as writer:
+            writer.write_table(arrow)
+        found = read_recording(tmp_path / f"run{suffix}")
+        assert found.t.tolist() == [0, step, 2 * step] and found.columns["on"].tolist() == [1, 0, 1]
+        assert found.units == {"T": "degC"}
+
+
+def test_packed_numbers_and_dates_of_netcdf(tmp_path):
+    """Packed numbers were read as they are, without a word."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "run.nc", "w") as file:
+        file.create_dataset("time", data=[0, 1, 2]).attrs["units"] = "minutes since 2026-03-01 10:00:00"
+        packed = file.create_dataset("T", data=np.array([205, -999, 225], np.int16))
+        packed.attrs.update({"units": "degC", "scale_factor": 0.1, "_FillValue": np.int16(-999)})
+    found = read_recording(tmp_path / "run.nc")
+    np.testing.assert_allclose(found.columns["T"], [20.5, np.nan, 22.5])
+    assert found.t.tolist() == [0, 60, 120] and found.meta["start"].startswith("2026-03-01T10:00")
+
+
+def test_wrong_dates_of_a_long_table_are_an_error_with_the_line(tmp_path):
+    text = table("entity_id,state,last_changed", f"a,1,{ISO}0", "b,2,10:00:01", f"a,3,{ISO}2", "b,4,10:00:03")
+    with pytest.raises(InputError, match=r"run\.csv:3: a time without a date among dates"):
+        read(tmp_path, text)
+
+
+def test_a_damaged_parquet_or_hdf5_file_is_named_in_one_line(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "good.h5", "w") as file:
+        file["t"], file["T"] = np.arange(50.0), np.arange(50.0)
+    pa.parquet.write_table(pa.table({"t": np.arange(50.0), "T": np.arange(50.0)}), tmp_path / "good.parquet")
+    refused = 0
+    for name in ("good.h5", "good.parquet"):
+        data = (tmp_path / name).read_bytes()
+        for at in range(0, len(data), 7):
+            damaged = tmp_path / f"bad{name[4:]}"
+            damaged.write_bytes(data[:at] + bytes((data[at] ^ 0x55,)) + data[at + 1 :])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    read_recording(damaged)
+                except InputError as e:
+                    refused += 1
+                    assert "\n" not in str(e) and "cannot be read" not in str(e), e
+    assert refused > 50
+
+
+def test_rows_of_a_day_have_no_daylight_saving(tmp_path):
+    """From ten hours a row on, each step seemed to be an hour off: 82800 s for a day, on Sundays of spring."""
+    for hours in (24, 12):
+        stamps = np.datetime64("2026-02-27T00:00:00") + np.arange(6) * np.timedelta64(hours, "h")
+        found = read(tmp_path, table("time,T", *(f"{str(s)},{k}" for k, s in enumerate(stamps))))
+        assert np.diff(found.t).tolist() == 5 * [3600 * hours]
