@@ -530,10 +530,37 @@ def test_nested_pages_are_told_apart(tmp_path, fault):
 
 @pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
 def test_a_number_that_the_file_names_as_no_value_is_none(tmp_path, fault):
-    words = 'VAL_ 801 T 255 "SNA" 254 "Error" ;\n'
-    dev = device(tmp_path, (START + fault + GOOD + words).encode("cp1252"), [T], "{t: air_c}")
-    for raw, status in ((255, ERROR), (60, OK)):
-        assert read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]] == status
+    words = ["SNA", "Error", "Sensor defect", "Signal_ungueltig", "Invalid_Value", "Init"]
+    fine = ["no error", "highest"]
+    table = " ".join(f'{255 - k} "{word}"' for k, word in enumerate(words + fine))
+    text = (START + fault + GOOD + f"VAL_ 801 T {table} ;\n").encode("cp1252")
+    dev = device(tmp_path, text, [T], "{t: air_c}")
+    for raw in range(240, 256):
+        status = read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]]
+        assert status == (ERROR if raw > 255 - len(words) else OK), raw
+
+
+def test_the_error_of_a_state_is_a_reading(tmp_path):
+    text = GOOD + ' SG_ S : 24|8@1+ (1,0) [0|0] "" HOST\n' + 'VAL_ 801 S 0 "off" 1 "on" 2 "Error" 3 "SNA" ;\n'
+    state = "s: {message: READING, signal: S, unit: '1', rate_hz: 20, stale_after_s: 1"
+    dev = device(tmp_path, START + text.replace("\n\n SG_", "\n SG_"), [state], "{s: amplifier_state}")
+    for raw, status in ((2, OK), (3, ERROR)):
+        assert read(dev, (801, bytes([0, 0, 0, raw, 0, 0, 0, 0]))).status[ROLE["amplifier_state"]] == status
+
+
+@pytest.mark.parametrize("fault", ["", FAULTS["an id without bit 31"]])
+def test_long_names_are_read_beside_a_fault_too(tmp_path, fault):
+    """The names that people see in their tools were unknown when another message had a fault."""
+    named = "".join(
+        f'BA_DEF_ {o} "System{of}LongSymbol" STRING ;\nBA_DEF_DEF_ "System{of}LongSymbol" "";\n'
+        for o, of in (("BO_", "Message"), ("SG_", "Signal"))
+    )
+    named += 'BA_ "SystemMessageLongSymbol" BO_ 801 "READING_with_a_long_name";\n'
+    named += 'BA_ "SystemSignalLongSymbol" SG_ 801 Volts "Volts_with_a_long_name";\n'
+    channel = V.replace("READING", "READING_with_a_long_name").replace("Volts", "Volts_with_a_long_name")
+    dev = device(tmp_path, START + fault + GOOD + named, [channel], "{v: voltage_v}")
+    frame = (801, bytes.fromhex("d2043c0000000000"))
+    assert read(dev, frame).value[ROLE["voltage_v"]] == pytest.approx(12.34)
 
 
 def test_a_page_is_selected_by_the_raw_number_of_its_multiplexer(tmp_path):

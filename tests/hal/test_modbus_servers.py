@@ -258,10 +258,15 @@ def test_sunspec_scale_registers(made, exponent, value):
         ("int16", "[-32768]", 0x7FFF, OK),
         ("uint16, low_bit: 4, bits: 8, signed: true", "[0x80]", 0x0801, ERROR),
         ("bcd16", "[9999]", 0x9999, ERROR),
+        ("uint64", "[0xFFFFFFFFFFFFFFFF]", 0xFFFF, ERROR),
+        ("uint64", "[18446744073709551615]", 0xFFFF, ERROR),
+        ("int64", "[0xFFFFFFFFFFFFFFFF]", 0xFFFF, ERROR),
+        ("int64", "[0x7FFFFFFFFFFFFFFF]", 0x8000, OK),
     ],
 )
 def test_sentinels_are_raw_numbers(made, kind, sentinels, word, status):
-    device, _ = made(honest, "0 100", {0: word, 100: 1}, f", type: {kind}, sentinels: {sentinels}")
+    known = {0: word, 1: word, 2: word, 3: word, 100: 1}
+    device, _ = made(honest, "0 100", known, f", type: {kind}, sentinels: {sentinels}")
     sample = Sample()
     device.connect()
     device.poll(sample)

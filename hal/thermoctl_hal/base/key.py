@@ -86,6 +86,8 @@ def sentinel_of(node: Node, bits: int, is_signed: bool, letter: str = "") -> flo
     the type cannot hold it."""
     value = number_of(node, "sentinels")
     is_text = isinstance(node.value, str)
+    if not letter and value % 1 == 0:  # exactly: a float has 53 bits
+        value = int(node.value, 16) if is_text else int(node.value)
     if letter:
         whole = int(value).to_bytes(bits // 8, "big") if is_text and 0 <= value < 1 << bits else b""
         try:

@@ -41,6 +41,8 @@ _TYPE = re.compile(r"\s*SIG_VALTYPE_\s+(\d+)\s+(\S+?)\s*:?\s*([0-3])\s*;")
 _EXTENDED_MUX = re.compile(r"\s*SG_MUL_VAL_\s+(\d+)\s+(\S+)\s+(\S+)\s+([^;]*);")
 _FORMAT = re.compile(r'\s*BA_DEF_\s+BO_\s+"VFrameFormat"|\s*BA_DEF_DEF_\s+"VFrameFormat"')
 _FORMAT_OF = re.compile(r'\s*BA_\s+"VFrameFormat"\s+BO_\s+(\d+)\s+([^;]*);')
+# Names of more than 32 characters: the number of the message, the signal or none, the name.
+_LONG = re.compile(r'BA_\s+"System(?:Message|Signal)LongSymbol"\s+(?:BO_|SG_)\s+(\d+)\s+(\w*)\s*"([^"]+)"')
 # The lines without which numbers are wrong.
 _KIND = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE)
 _PAGE = re.compile(r"m\d")
@@ -157,9 +159,12 @@ def _by_message(path: Path, text: str, reason: str) -> DbcFile:
     if not blocks:
         raise ValueError(f"{NO_MESSAGES}; {reason}")
     messages: list[Message] = []
+    long = [(int(number), name, new) for number, name, new in _LONG.findall(text)]
     for block in blocks:
         message = _message(block, attributes, faults, remarks)
         if message is not None:
+            names = {name: new for number, name, new in long if number == block.number}
+            _rename(message, names.pop("", message.name), names)
             messages.append(message)
     faults |= _doubled(iter(messages))
     if not remarks:

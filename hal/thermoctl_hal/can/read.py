@@ -30,8 +30,12 @@ if TYPE_CHECKING:  # loading cantools takes a second
     from cantools.database.can import Signal
 
 # Words of a file's value table that name a raw number without a reading.
+# A signal with a unit has further ones; of a state an error is a reading.
 _NO_VALUE = re.compile(
     r"(?i)(SNA|(signal|value)?[ _]?(not[ _]?available|invalid)|no[ _](value|data|signal))[ _]*"
+)
+_NO_QUANTITY = re.compile(
+    r"(?i)(?<![^\W_])(SNA|not[ _]?avail|invalid|init|(?<!no[ _])(err|fault|fail|defect)|(un|in)g(ü|ue)ltig|fehler|no[ _](value|data|signal|sensor))"
 )
 # A value belongs to a raw number if it is this close to the number's value, in steps of the signal.
 NEAR_RAW = 0.01
@@ -70,7 +74,8 @@ def read_signal(s: Section, spec: BusSpec) -> DbcSource:
     signal = _signal_of(s, dbc, message)
     sentinels = tuple(_raw_sentinel(n, signal) for n in k["sentinels"] or ())
     choices: Mapping[Any, object] = {} if signal.is_float else signal.choices or {}
-    sentinels += tuple(float(raw) for raw, word in choices.items() if _NO_VALUE.fullmatch(str(word)))
+    named_so = _NO_QUANTITY.search if signal.unit else _NO_VALUE.fullmatch
+    sentinels += tuple(float(raw) for raw, word in choices.items() if named_so(str(word)))
     bits = 0 if signal.is_float or signal.is_signed or not dbc.is_j1939(message) else signal.length
     absent = range(0xFE << bits - 8, 1 << bits) if bits in (8, 16, 24, 32) else range(0)  # SAE J1939-71
     return DbcSource(message, signal.name, invalid, sentinels, absent)
