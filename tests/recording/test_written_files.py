@@ -2,6 +2,7 @@
 
 import datetime
 import warnings
+import zipfile
 
 import numpy as np
 import pyarrow as pa
@@ -144,3 +145,51 @@ def test_rows_of_a_day_have_no_daylight_saving(tmp_path):
         stamps = np.datetime64("2026-02-27T00:00:00") + np.arange(6) * np.timedelta64(hours, "h")
         found = read(tmp_path, table("time,T", *(f"{str(s)},{k}" for k, s in enumerate(stamps))))
         assert np.diff(found.t).tolist() == 5 * [3600 * hours]
+
+
+def test_long_tables_of_parquet_and_with_an_empty_tag(tmp_path):
+    arrow = pa.table({"time": [0.0, 0, 1, 1], "sensor": ["T", "P", "T", "P"], "value": [20.5, 1, 21.5, 2]})
+    pa.parquet.write_table(arrow, tmp_path / "run.parquet")
+    rows = ('101,"",20.5,C,0', '102,"",1,VDC,0', '101,"",21.5,C,1', '102,"",2,VDC,1')
+    for found, names in (
+        (read_recording(tmp_path / "run.parquet"), ["T", "P"]),
+        (read(tmp_path, table("Channel,Tag,Reading,Unit,Time", *rows)), ["Channel_101", "Channel_102"]),
+    ):
+        assert [found.columns[n].tolist() for n in names] == [[20.5, 21.5], [1, 2]]
+        assert found.t.tolist() == [0, 1]
+
+
+def test_archives_and_excel_files_of_another_suffix(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in (["t", "T"], [0, 20.5], [1, 21.5]):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    (tmp_path / "run.xlsx").rename(tmp_path / "run.dat")
+    assert read_recording(tmp_path / "run.dat").columns["T"].tolist() == AB[1][:2]
+    with zipfile.ZipFile(tmp_path / "run.zip", "w") as archive:
+        archive.writestr("run.csv", "t,T\n0,1\n")
+    with pytest.raises(InputError, match="unpack the archive, or save its table as .xlsx or .csv"):
+        read_recording(tmp_path / "run.zip")
+
+
+def test_a_tdms_file_that_was_cut_is_said(tmp_path):
+    nptdms = pytest.importorskip("nptdms")
+    with nptdms.TdmsWriter(tmp_path / "run.tdms") as writer:
+        for k in range(2):
+            values = np.arange(100.0) + 100 * k
+            writer.write_segment([nptdms.ChannelObject("g", "T", values, {"wf_increment": 0.5})])
+    path = tmp_path / "run.tdms"
+    assert not any("cut off" in n for n in read_recording(path).notes)
+    path.write_bytes(path.read_bytes()[:-80])
+    found = read_recording(path)
+    assert found.columns["T"].tolist() == list(range(190)) and any("cut off" in n for n in found.notes)
+
+
+def test_lakhs_and_times_of_unknown_form(tmp_path):
+    assert read(tmp_path, table("t,P", '0,"1,00,000.5"', '1,"99,999.5"')).columns["P"].tolist() == [
+        100000.5,
+        99999.5,
+    ]
+    with pytest.raises(InputError, match="no time in a form that is known: 'Elapsed': 'PT0S'"):
+        read(tmp_path, table("Elapsed,T", "PT0S,20", "PT30S,21", "PT1M,22"))

@@ -40,7 +40,7 @@ HEAD_LINES = 6  # number of lines above the data from which names, units and kin
 UNIT_LENGTH = 16  # largest number of characters of a cell in a line of units
 _COMMENT = re.compile(r"[ \t]*(%|#(?!\s*[,;\t|]|N/A|NA\b|NV\b|(VALUE|WERT|DIV/0|NUM|REF|BEZUG|NULL)!))")
 # The line below the header of a table in Markdown or SQL.
-_RULER = re.compile(r"\s*[|+][\s|+:=-]*-{3}[\s|+:=-]*$")
+_RULER = re.compile(r"\s*([|+][\s|+:=-]*)?-{3}[\s|+:=-]*$")
 FACT = re.compile(r"(t0|tInc)\s*=\s*(.+)$")  # a statement in place of a name (Rigol)
 # LabVIEW and Bio-Logic state where the header ends; its last line has the names.
 _HEADER_END = re.compile(r"\*{3}End_of_Header\*{3}|Nb header lines\W+(\d+)")

@@ -9,8 +9,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import re
 import warnings
+import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, date, datetime, time, timedelta
@@ -117,12 +119,16 @@ def read_tdms(path: Path, notes: list[str], group: str | None = None) -> list[Sh
 
     A name that several groups use becomes group_channel. Raises InputError."""
     nptdms = load("nptdms", path)
+    logging.getLogger("nptdms").setLevel(logging.ERROR)  # a note says that the file was cut
     path.stat()
     try:
+        file = nptdms.TdmsFile.read(str(path))
         groups = {
             g.name: {c.name: (np.asarray(c[:]), dict(c.properties)) for c in g.channels()}
-            for g in nptdms.TdmsFile.read(str(path)).groups()
+            for g in file.groups()
         }
+        if file.file_status.incomplete_final_segment:
+            notes.append("the last segment is shorter than stated: was the file cut off?")
     except Exception as e:  # npTDMS likewise
         raise _damaged(path, "TDMS", e) from None
     if group is not None:
@@ -183,10 +189,14 @@ def read_excel(path: Path, sheet: str | None = None) -> list[tuple[str, bytes]]:
 
     Raises InputError."""
     openpyxl = load("openpyxl", path)
-    path.stat()
     sheets = []
+    with open(path, "rb") as f:  # openpyxl refuses the path of an Excel file with another suffix
+        data = io.BytesIO(f.read())
     try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        with zipfile.ZipFile(data) as archive:
+            if "[Content_Types].xml" not in archive.namelist():
+                raise ValueError("unpack the archive, or save its table as .xlsx or .csv")
+        book = openpyxl.load_workbook(data, read_only=True, data_only=True)
         titles = [w.title for w in book.worksheets]
         for page in sorted(book.worksheets, key=lambda w: w.sheet_state != "visible"):
             out = io.StringIO()

@@ -165,7 +165,7 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
 def pivoted(sheet: Sheet) -> list[Sheet] | None:
     """Return a sheet for each signal of a long table (signal, time, value); None for a wide one."""
     lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
-    identity = next((lower[k] for k in IDS if k in lower), None)
+    identity = next((lower[k] for k in IDS if k in lower and _any(sheet.columns[lower[k]])), None)
     value = next((lower[k] for k in VALUES if k in lower), None)
     if identity is None and value is None:
         identity, value = _labelled_columns(sheet)
@@ -200,6 +200,10 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     if sheets:
         sheets[0].notes += sheet.notes
     return sheets or None
+
+
+def _any(cells: Any) -> bool:
+    return isinstance(cells, np.ndarray) or bool(pc.any(pc.not_equal(pc.fill_null(cells, ""), "")).as_py())
 
 
 def _of_one_day(sheet: Sheet, cells: Any) -> Any:

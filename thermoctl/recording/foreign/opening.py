@@ -89,7 +89,9 @@ def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     if kind == "frames":
         raise _frames(path)
     if kind == "xls":
-        raise InputError(f"{path}: an Excel file of before 2007; save it as .xlsx or .csv")
+        raise InputError(
+            f"{path}: an Excel file of before 2007, or with a password; save it as .xlsx or .csv"
+        )
     if (size := path.stat().st_size) > files.MAX_CSV_BYTES:
         raise InputError(
             f"{path}: {size} bytes; a text file of at most {files.MAX_CSV_BYTES} was expected (cut it in parts)"
@@ -124,11 +126,16 @@ def _of_names(sheet: Sheet) -> Sheet:
     return replace(sheet, columns={names[n]: c for n, c in sheet.columns.items()}, units=units)
 
 
+def _of_arrow(path: Path, arrow: pa.Table) -> list[Sheet]:
+    sheet = formats.read_arrow(path, arrow)
+    return layouts.pivoted(sheet) or [sheet]
+
+
 def _arrow(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     try:
         table = files.read_table(path)
     except InputError:  # another program's
-        return [formats.read_arrow(path, files.arrow_of(path))]
+        return _of_arrow(path, files.arrow_of(path))
     return [Sheet({"t": table.t, **table.columns}, place_in(path), meta=table.meta)]
 
 
@@ -162,7 +169,7 @@ def _excel(path: Path, how: How, notes: list[str]) -> list[Sheet]:
 
 def _parquet(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     with pa.parquet.ParquetFile(path, page_checksum_verification=True) as f:
-        return [formats.read_arrow(path, f.read())]
+        return _of_arrow(path, f.read())
 
 
 _READERS: dict[str, Callable[[Path, How, list[str]], list[Sheet]]] = {

@@ -299,9 +299,9 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
             note = f"{step:g} s from row to row, as --time says"
             return [(Clock((), Seconds(t, sheet.start, note, "unit"), 0, ""), names)]
         if chosen is None:
-            named = [n for n in names if n.strip() and "\0" not in n]
+            given = [n for n in names if n.strip() and "\0" not in n]
             raise InputError(
-                f"{path}: no column '{how.time}'{suggest(how.time, named)}; the columns are {', '.join(named)}; {_ADVICE}"
+                f"{path}: no column '{how.time}'{suggest(how.time, given)}; the columns are {', '.join(given)}; {_ADVICE}"
             )
         try:
             seconds = axis.chosen(how.time, sheet.columns[chosen], sheet.units.get(chosen))
@@ -317,7 +317,7 @@ def _clocks(path: Path, sheet: Sheet, how: How) -> list[tuple[Clock, list[str]]]
         texts = [
             f"'{_plain(n)}': '{w.strip()[:40]}'"
             for n, w in sheet.left.items()
-            if sum(map(str.isdigit, w)) > 3
+            if sum(map(str.isdigit, w)) > 3 or named(n) > 0
         ]
         unread = f"; no time in a form that is known: {', '.join(texts)}" if texts else ""
         raise InputError(
