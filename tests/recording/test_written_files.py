@@ -193,3 +193,39 @@ def test_lakhs_and_times_of_unknown_form(tmp_path):
     ]
     with pytest.raises(InputError, match="no time in a form that is known: 'Elapsed': 'PT0S'"):
         read(tmp_path, table("Elapsed,T", "PT0S,20", "PT30S,21", "PT1M,22"))
+
+
+@pytest.mark.parametrize(
+    "stamp, start",
+    [
+        ("02/03/2026 10.00.0{}", "2026-03-02T10:00"),  # Italian
+        ("2.3.2026 klo 10.00.0{}", "2026-03-02T10:00"),  # Finnish
+        ("2026.03.02. 10:00:0{}", "2026-03-02T10:00"),  # Hungarian
+        ("2026. 3. 2. 오전 10:00:0{}", "2026-03-02T10:00"),
+        ("02/03/2569 10:00:0{}", "2026-03-02T10:00"),  # Thai: was 1984
+        ("2569-03-02 10:00:0{}", "2026-03-02T10:00"),
+        ("2026-03-02T10:00:0{}+01:00[Europe/Berlin]", "2026-03-02T09:00"),  # Java
+        ("2026-03-02 10:00:0{} Europe/Berlin", "2026-03-02T10:00"),
+        ("02.03.2026;10.00.0{}", "2026-03-02T10:00"),
+    ],
+)
+def test_dates_of_further_countries(tmp_path, stamp, start):
+    names = "Datum;Uhrzeit;T" if ";" in stamp else "Zeit;T"
+    found = read(tmp_path, table(names, *(f"{stamp.format(k)};2{k},5" for k in range(3))))
+    assert found.t.tolist() == [0, 1, 2] and found.columns["T"].tolist() == AB[1]
+    assert found.meta["start"].startswith(start)
+
+
+def test_a_year_that_nanoseconds_cannot_hold_is_refused(tmp_path):
+    """The last date of a database was a date of our century."""
+    for date in ("9999-12-31 23:59:5", "0001-01-01 00:00:0"):
+        with pytest.raises(InputError, match=r":2: .*a year of 1678 to 2261 were expected"):
+            read(tmp_path, table("time,T", f"{date}8,20", f"{date}9,21"))
+
+
+def test_a_rate_and_units_in_comments(tmp_path):
+    for head in ("Sample rate [Hz];2", "# fs = 2 Hz"):
+        assert read(tmp_path, table(head, "T;P", "20,5;1", "21,5;2", "22,5;3")).t.tolist() == [0, 0.5, 1]
+    found = read(tmp_path, table("# time T P", "# min degC W", "0 20.5 1", "1 21.5 2", "2 22.5 3"))
+    assert found.t.tolist() == [0, 60, 120] and found.columns["T"].tolist() == AB[1]
+    assert found.units == {"T": "degC", "P": "W"}

@@ -38,6 +38,10 @@ _SPELLINGS = tuple(
     for pattern, by in (
         ("[\u00a0\u2009\u202f]", " "),
         (r"(\d{4})\s\([A-Z][\w ]+\)$", r"\1"),  # GMT+0100 (Central European Time) of JavaScript
+        (r"\s?\[?[A-Z][a-z]+/[A-Z]\w+(?:/\w+)?\]?$", ""),  # a region's name, with Java behind the offset
+        (r"^(\d{4})\. ?(\d{1,2})\. ?(\d{1,2})\. ", r"\1-\2-\3 "),  # Hungary, Korea
+        (r"^(\d\S*\d),? (?:klo )?(\d{1,2})\.(\d{2})\.(\d{2})", r"\1 \2:\3:\4"),  # Italy, Denmark, Finland
+        (r"^(\d\S*\d),? (?:klo )?(\d{1,2})\.(\d{2})$", r"\1 \2:\3"),
         (r"^(?:(?i:mon|tue|wed|thu|fri|sat|sun|mo|di|mi|do|fr|sa|so){L}*\.?,?\s+)(\d|{L})", r"\1"),
         (r"^(\d\S*[T ]\d{1,2}:\d{2}(?::[\d.]+)?Z?)(?:/| - )\d.*$", r"\1"),  # from one time to another
         (r"([ap])\.\s?m\.", r"\1m"),
@@ -331,6 +335,8 @@ def from_texts(texts: pa.Array) -> Seconds:
     if (quick := _iso(texts)) is not None:
         return quick
     tidy = tidied(texts)
+    if _with_points(tidy):
+        tidy = pc.replace_substring(tidy, ".", ":")
     if pc.all(pc.match_substring_regex(tidy, _DURATION)).as_py():
         parts = pc.extract_regex(tidy, _DURATION)
         t = _whole(parts.field("d")) * DAY_S + _clock_ns(_fields(parts.field("rest"))) / 1e9
@@ -358,6 +364,12 @@ def from_texts(texts: pa.Array) -> Seconds:
     if zone and zone.lower() not in ("z", "utc", "gmt") and zone[0] not in "+-":
         seconds = replace(seconds, note=f"{seconds.note} (zone {zone})")
     return seconds
+
+
+def _with_points(tidy: pa.Array) -> bool:
+    """Return whether all texts are times of day such as 10.00.59: no month is 00."""
+    times = pc.all(pc.match_substring_regex(tidy, r"^([01]?\d|2[0-4])\.[0-5]\d\.[0-5]\d$")).as_py()
+    return bool(times and pc.any(pc.match_substring_regex(tidy, r"^\d+\.00\.")).as_py())
 
 
 def _fields(tidy: pa.Array) -> dict[str, pa.Array]:
@@ -440,6 +452,8 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray, points: bool) -> tuple
             )
         middle = pc.if_else(pc.equal(middle, text), str(month), middle)
     a, b, c = _whole(field["a"]), _whole(middle), _whole(field["c"])
+    buddhist = 2400 < max(a.max(), c.max()) < 2700
+    a, c = (np.where(part > 2400, part - 543, part) if buddhist else part for part in (a, c))
     if a.max() > 31 or len(field["a"][0].as_py()) == 4:
         orders = {"year-month-day": (a, b, c)}
     else:
@@ -453,13 +467,16 @@ def _dated(field: dict[str, pa.Array], clock: np.ndarray, points: bool) -> tuple
     if points and "day.month.year" in by_order:
         by_order.pop("month/day/year", None)
     if not by_order:
-        raise ClockError(0, "no date: a month of 1 to 12 and a day of 1 to 31 were expected")
+        raise ClockError(
+            0, "no date: a month of 1 to 12, a day of 1 to 31, a year of 1678 to 2261 were expected"
+        )
     if "year/month/day" in by_order and YEARS[0] <= a[0] <= YEARS[1] and not YEARS[0] <= c[0] <= YEARS[1]:
         prefer = ["year/month/day", *orders]
     else:
         halves = pc.any(pc.not_equal(field["p"], "")).as_py()
         prefer = ["month/day/year", *orders] if halves else list(orders)
-    return _one_order(by_order, prefer)
+    ns, order = _one_order(by_order, prefer)
+    return ns, f"{order} of Buddhist years" if buddhist else order
 
 
 def _one_order(possible: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.ndarray, str]:
@@ -487,9 +504,9 @@ def _one_order(possible: dict[str, np.ndarray], prefer: list[str]) -> tuple[np.n
 
 
 def _valid(year: np.ndarray, month: np.ndarray, day: np.ndarray) -> bool:
-    if not (
-        month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31 and year.min() >= 1
-    ):
+    if not (month.min() >= 1 and month.max() <= 12 and day.min() >= 1 and day.max() <= 31):
+        return False
+    if year.min() < 1678 or year.max() > 2261:  # those of nanoseconds in 64 bits
         return False
     months = ((year - 1970) * 12 + month - 1).astype("datetime64[M]")
     length = ((months + 1).astype("datetime64[D]") - months.astype("datetime64[D]")).astype(int)

@@ -487,10 +487,8 @@ def _header_lines(
     if parted and len(stated) > 1:
         lines_of = []  # statements such as `Sampling Period,4e-7`, and a title above the rows (GW Instek)
     if not lines_of or parted:
-        commented = _commented(comments, separator, width, head) or (
-            not lines_of and _listed(comments, width)
-        )
-        lines_of = [commented] if commented else lines_of
+        listed = _listed(comments, width) if not lines_of else None
+        lines_of = _commented(comments, separator, width) or ([listed] if listed else lines_of)
     return lines_of
 
 
@@ -583,16 +581,18 @@ def _is_kinds(cells: list[str]) -> bool:
     return all(c.lower() in _KINDS for c in cells) and len({c.lower() for c in cells}) <= len(_KINDS)
 
 
-def _commented(
-    comments: list[tuple[int, str]], separator: str, width: int, head: list[tuple[int, list[str]]]
-) -> tuple[int, list[str]] | None:
-    """Return the last comment as wide as the data: the header of numpy, gnuplot and others."""
+def _commented(comments: list[tuple[int, str]], separator: str, width: int) -> list[tuple[int, list[str]]]:
+    """Return the last comment as wide as the data, of units with that above: numpy, gnuplot, others."""
+    found: list[tuple[int, list[str]]] = []
     for number, text in reversed(comments):
         for sep in (separator, ",", ";", "\t", "  ", " "):
             cells = cells_of(text, sep)
             if len(cells) == width and not any(_kind(c) in "t" for c in cells) and not _STATED.match(text):
-                return number, cells
-    return None
+                if found:
+                    return [(number, cells), *found] if _is_units(found[0][1], cells) else found
+                found = [(number, cells)]
+                break
+    return found
 
 
 def _listed(comments: list[tuple[int, str]], width: int) -> tuple[int, list[str]] | None:

@@ -10,13 +10,13 @@ from thermoctl.units import SECONDS
 
 _STEP = re.compile(
     r"(?i)^(?:.*(?:sampl\w*|scan|log\w*|record\w*|acqui\w*|mess|abtast)\w*[\s_-]*(?:interval|period|time|rate|freq\w*|clock|step|intervall|zeit|rate)?"
-    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|tinc|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency)\b.*$"
+    r"|interval|period|x?increment|xincr\w*|delta[_ ]?[xt]|tinc|dt|h(?:orizontal)?resolution|timebase|samplerate|frequency|fs)\b.*$"
 )
 _INTERVAL = re.compile(
-    r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz"
+    r"(?i)interval|period|time|rate|freq|clock|step|zeit|incr|xinc|tinc|delta|^dt|resolution|hz|^fs"
 )
 _DURATION = re.compile(r"(?i)(?:record|log|acqui|mess)\w*[\s_-]*(?:time|zeit)")  # whole recording
-_RATE = re.compile(r"(?i)rate|freq|hz")
+_RATE = re.compile(r"(?i)rate|freq|hz|^fs")
 _VALUE = re.compile(r"^\s*([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([^\d\s]*)\s*$")
 
 
@@ -97,7 +97,9 @@ def stated_step(facts: dict[str, list[str]]) -> tuple[float, float] | None:
         stated = (
             match[2] or next((v for v in filled[1:2] if not is_number(v)), "") or (split_unit(key)[1] or "")
         )
-        unit = time_unit(stated) or spelled(stated) or ("Hz" if _RATE.search(key) else "s")
+        unit = (
+            time_unit(stated) or spelled(stated.replace("hz", "Hz")) or ("Hz" if _RATE.search(key) else "s")
+        )
         if unit in SECONDS and size > 0 and "rate" not in key:
             return size * SECONDS[unit], start
         if unit in ("Hz", "kHz", "MHz", "Sa/s", "S/s", "1/s") and size > 0:
