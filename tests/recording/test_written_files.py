@@ -1,6 +1,7 @@
 """Files as tools write them: a small input of our own for each habit, compared with the numbers that it holds."""
 
 import datetime
+import json
 import warnings
 import zipfile
 
@@ -229,3 +230,47 @@ def test_a_rate_and_units_in_comments(tmp_path):
     found = read(tmp_path, table("# time T P", "# min degC W", "0 20.5 1", "1 21.5 2", "2 22.5 3"))
     assert found.t.tolist() == [0, 60, 120] and found.columns["T"].tolist() == AB[1]
     assert found.units == {"T": "degC", "P": "W"}
+
+
+def test_overload_of_a_multimeter_is_no_litre(tmp_path):
+    """0.L was 0, with the unit L."""
+    found = read(
+        tmp_path, table("Time,Main,Unit", "0,12.345,V DC", "1,0.L,V DC", "2,OL.,V DC", "3,12.5,V DC")
+    )
+    np.testing.assert_allclose(found.columns["Main"], [12.345, np.nan, np.nan, 12.5])
+
+
+def test_the_scale_of_a_temperature_as_a_word_of_the_name(tmp_path):
+    """Without it 68 degF are 68 in the plant's degC."""
+    for clock in ("t", "Timestamp"):
+        found = read(tmp_path, table(f"{clock},Temperature_Fahrenheit,air celsius", "0,68.5,20", "1,69.5,21"))
+        assert found.units == {"Temperature_Fahrenheit": "degF", "air celsius": "degC"}
+
+
+def test_topics_of_mqtt_are_signals(tmp_path):
+    """Their values stood in one column, one after the other."""
+    rows = [
+        f"2026-03-02T10:00:0{k}.{s} oven/{n} {v}"
+        for k in range(3)
+        for s, n, v in ((1, "T", 20 + k), (2, "P", k))
+    ]
+    found = read(tmp_path, table(*rows))
+    assert found.columns.keys() == {"oven/T", "oven/P"}
+    np.testing.assert_allclose(found.columns["oven/T"], [20, np.nan, 21, np.nan, 22, np.nan])
+
+
+def test_units_beside_a_table_of_json(tmp_path):
+    path = tmp_path / "run.json"
+    hourly = {"time": [f"2026-03-02T0{k}:00" for k in range(3)], "temperature_2m": [5.0, 6.0, 7.0]}
+    path.write_text(
+        json.dumps({"hourly_units": {"time": "iso8601", "temperature_2m": "°C"}, "hourly": hourly})
+    )
+    found = read_recording(path)
+    assert found.units == {"temperature_2m": "degC"} and found.t.tolist() == [0, 3600, 7200]
+
+
+def test_vectors_of_matlab_of_other_lengths_are_named(tmp_path):
+    savemat = pytest.importorskip("scipy.io").savemat
+    savemat(tmp_path / "run.mat", {"t": np.arange(6.0), "T": np.arange(5.0)})
+    with pytest.raises(InputError, match="'T' left out: float64, size 5"):
+        read_recording(tmp_path / "run.mat")

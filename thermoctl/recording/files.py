@@ -58,7 +58,7 @@ def read_table(path: str | Path | Table, columns: Iterable[str] | None = None) -
     want = None if columns is None else list(dict.fromkeys(columns))
     try:
         return checked(path, reader(path, want))
-    except (OSError, pa.ArrowException) as e:
+    except (OSError, pa.ArrowException, OverflowError) as e:  # a date of another era overflows
         raise unreadable(path, e) from None
     except UnicodeDecodeError:
         raise InputError(

@@ -69,9 +69,12 @@ def _tables(path: Path, content: Any) -> list[Sheet] | None:
             return sheets
     if sheet := _lists(path, content):
         return [sheet]
-    return _inner(path, content.items()) or _inner(
-        path, ((k, x) for k, v in content.items() if isinstance(v, list) for x in v)
-    )
+    sheets = _inner(path, content.items())
+    for sheet in sheets or ():
+        stated = content.get(f"{sheet.name}_units")  # Open-Meteo's hourly, hourly_units
+        units = stated.items() if isinstance(stated, dict) else ()
+        sheet.units |= {n: spelled(u, n) or "" for n, u in units if n in sheet.columns and known(str(u))}
+    return sheets or _inner(path, ((k, x) for k, v in content.items() if isinstance(v, list) for x in v))
 
 
 def _inner(path: Path, items: Iterable[tuple[str, Any]]) -> list[Sheet] | None:

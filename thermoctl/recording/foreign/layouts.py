@@ -28,6 +28,7 @@ _POINT = re.compile(
 )
 _STATS = re.compile(r"^(?:[^\n]*?[ \t])?Stats (\d+\.\d+): (.*)$", re.MULTILINE)
 _LABEL = r"([A-Za-z_]\w*):\s?([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+_LABEL_ALONE = r"^.*\w[:=]$|^[^\s/]+/\S+$"  # `2:`, `T=`, and a topic of MQTT
 _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
@@ -229,7 +230,7 @@ def _labelled_columns(sheet: Sheet) -> tuple[str | None, str | None]:
     cells = sheet.columns[names[1]]
     texts = cells if not isinstance(cells, np.ndarray) else pa.array([], pa.string())
     seen = len(pc.unique(texts))
-    if 1 < seen <= len(texts) / 2 and pc.all(pc.match_substring_regex(texts, r"^.*\w[:=]$")).as_py():
+    if 1 < seen <= len(texts) / 2 and pc.all(pc.match_substring_regex(texts, _LABEL_ALONE)).as_py():
         return names[1], names[2]
     numbers = _numbers(cells)
     high = numbers.max(initial=0)

@@ -48,7 +48,8 @@ def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str])
         parts += _timed(path, values, how)
         later += values.notes
     if not parts:
-        raise InputError(f"{path}: no channels with a time; at least one was expected")
+        lost = f" ({'; '.join(notes)})" if notes else ""
+        raise InputError(f"{path}: no channels with a time; at least one was expected{lost}")
     table = parts[0] if len(parts) == 1 else _united(path, parts)
     if not table.columns:
         text = ", ".join(n for s in sheets for n in s.columns if not isinstance(s.columns[n], np.ndarray))

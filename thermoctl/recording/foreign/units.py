@@ -26,6 +26,7 @@ _UNIT = re.compile(rf"1$|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
 # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope.
 _LAST = re.compile(r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$")
+_SCALE = re.compile(r"(?i)(?:^|[\W_])(celsius|fahrenheit|kelvin)$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
 _NO_UNITS = {"", "-", "–", "--", "ts", "rn", "0/1", "1/0", *WORDS["pairs"].split()}  # ts and rn: TOA5
@@ -80,7 +81,8 @@ def split_unit(header: str) -> tuple[str, str | None]:
     text = header.strip()
     match = _NAMED.match(text)
     if not match:
-        return text, None
+        word = _SCALE.search(text)  # the name keeps it
+        return text, spelled(word[1]) if word else None
     name, square, bracket, slash = match.groups()
     unit = (square if square is not None else bracket if bracket is not None else slash).strip()
     if square is not None and known(name) and not (known(unit) or has_factor(unit)):  # °C [Kanal 1] of Testo
