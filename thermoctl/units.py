@@ -48,16 +48,17 @@ SECONDS = {symbol: float(size) for symbol, (of, size) in SYMBOLS.items() if of =
 """Seconds of a unit of time."""
 SPELLINGS = {
     "degC": "celsius | °c | ℃ | degc | deg c | deg. c | grad c | degree c | degrees c | degree "
-    "celsius | degrees celsius | deg_c | ºc | ˚c | oc | â°c | �c",
+    "celsius | degrees celsius | deg_c | ºc | ˚c | oc | â°c | �c | c° | º c | grd c",
     "degF": "fahrenheit | °f | ℉ | degf | deg f | deg. f",
-    "K": "kelvin",
+    "K": "kelvin | °k",
     "deg": "° | grad | degree | degrees",
     "h": "hr | hrs | hour | hours | stunde | stunden | std | heure | heures | hora | horas | ore | "
     "uur | 小时",
     "ohm": "ohms | ω",
-    "V": "volt | volts | vdc | vac | vrms | v dc | v ac | v rms | v_rms",
-    "mV": "millivolt | millivolts",
+    "V": "volt | volts | vdc | vac | vrms | v dc | v ac | v rms | v_rms | dc v | ac v",
+    "mV": "millivolt | millivolts | mvdc | mvac | mv dc | mv ac",
     "A": "ampere | amperes | amp | amps | arms | a dc | a ac | a rms | a_rms",
+    "mA": "milliampere | milliamperes | milliamp | milliamps | ma dc | ma ac",
     "W": "watt | watts",
     "kW": "kw",
     "kWh": "kwh",

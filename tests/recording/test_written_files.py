@@ -274,3 +274,36 @@ def test_vectors_of_matlab_of_other_lengths_are_named(tmp_path):
     savemat(tmp_path / "run.mat", {"t": np.arange(6.0), "T": np.arange(5.0)})
     with pytest.raises(InputError, match="'T' left out: float64, size 5"):
         read_recording(tmp_path / "run.mat")
+
+
+@pytest.mark.parametrize(
+    "head, units",
+    [
+        ([";Oven;Oven;Room", "time;T;P;T"], {}),
+        (["Time;Oven;;Room", ";T;P;T", "s;°C;W;°C"], {"T_1": "degC", "P": "W", "T_2": "degC"}),
+    ],
+)
+def test_names_below_those_of_groups_are_no_units(tmp_path, head, units):
+    """The names T and P were tesla and a second time."""
+    found = read(tmp_path, table(*head, *(f"{k};2{k},5;{k % 2};1{k},5" for k in range(4))))
+    assert found.columns["T_1"].tolist() == [20.5, 21.5, 22.5, 23.5] and found.columns["P"].tolist() == [
+        0,
+        1,
+        0,
+        1,
+    ]
+    assert found.columns["T_2"].tolist() == [10.5, 11.5, 12.5, 13.5] and found.units == units
+
+
+def test_lines_of_names_and_values_with_equals_signs(tmp_path):
+    found = read(tmp_path, table(*(f"time={k} T={20 + k}.5 P={k}" for k in range(3))))
+    assert found.t.tolist() == [0, 1, 2] and found.columns["T"].tolist() == AB[1]
+
+
+@pytest.mark.parametrize(
+    "written, unit",
+    [("C°", "degC"), ("º C", "degC"), ("mV DC", "mV"), ("mVDC", "mV"), ("AC V", "V"), ("mA DC", "mA")],
+)
+def test_spellings_of_units_in_round_brackets(tmp_path, written, unit):
+    """One that is not known stays in the name, so that nothing refuses mV for V."""
+    assert read(tmp_path, table(f"time,x ({written})", "0,20", "1,21")).units == {"x": unit}

@@ -361,6 +361,8 @@ def _bare(cell: str) -> str:
 def _is_units(cells: list[str], above: list[str]) -> bool:
     """Return whether most cells of a line are units, and the line above it can be the header."""
     bare = [_bare(c) for c in cells]
+    if any(named(c) > 0 >= named(a) and time_unit(c) is None for c, a in zip(bare, above, strict=False)):
+        return False  # the names, below those of groups
     words = [c for c in bare if c and not is_number(c) and c.lower() not in ("ts", "rn") and named(c) == 0]
     right = sum(known(c) and not re.fullmatch("[A-Z][0-9]", c) for c in bare)  # T1 and V2 are names
     names = sum(bool(c) and (not is_number(c) or re.fullmatch(r"\d{1,3}", c) is not None) for c in above)
@@ -378,8 +380,11 @@ def _unit_lines(lines_of: list[tuple[int, list[str]]]) -> list[tuple[int, list[s
         lines_of.pop()  # the line below the units (Origin)
     if len(lines_of) > 1 and _are_above(lines_of[-2][1], lines_of[-1][1]):
         return [lines_of.pop(-2)]
-    found = []
-    while len(lines_of) > 1 and (_is_units(lines_of[-1][1], lines_of[-2][1]) or _is_kinds(lines_of[-1][1])):
+    found: list[tuple[int, list[str]]] = []
+    while len(lines_of) > 1 and (
+        _is_kinds(lines_of[-1][1])
+        or (all(_is_kinds(c) for _, c in found) and _is_units(lines_of[-1][1], lines_of[-2][1]))
+    ):
         found.append(lines_of.pop())
     return found
 

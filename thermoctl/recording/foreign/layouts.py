@@ -27,10 +27,10 @@ _POINT = re.compile(
     r"^(?P<head>(?:\\.|[^\s\\])+) (?P<fields>(?:\\.|\"(?:\\.|[^\"\\])*\"|[^\s\\\"])+)(?: (?P<time>-?\d+))?$"
 )
 _STATS = re.compile(r"^(?:[^\n]*?[ \t])?Stats (\d+\.\d+): (.*)$", re.MULTILINE)
-_LABEL = r"([A-Za-z_]\w*):\s?([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+_LABEL = r"([A-Za-z_]\w*)[:=]\s?([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
 _LABEL_ALONE = r"^.*\w[:=]$|^[^\s/]+/\S+$"  # `2:`, `T=`, and a topic of MQTT
 _LABELS = re.compile(
-    r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*:\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
+    r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*[:=]\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
 LEAD = 65536  # number of first bytes from which the layout is found
