@@ -307,3 +307,17 @@ def test_lines_of_names_and_values_with_equals_signs(tmp_path):
 def test_spellings_of_units_in_round_brackets(tmp_path, written, unit):
     """One that is not known stays in the name, so that nothing refuses mV for V."""
     assert read(tmp_path, table(f"time,x ({written})", "0,20", "1,21")).units == {"x": unit}
+
+
+def test_lines_of_limits_above_the_table_are_no_names(tmp_path):
+    head = ["Time;T;P", "s;°C;W", "Min;-50;0", "Max;150;10"]
+    found = read(tmp_path, table(*head, *(f"{k};2{k},5;{k % 2}" for k in range(5))))
+    assert list(found.columns) == ["T", "P"] and found.units == {"T": "degC", "P": "W"}
+    found = read(tmp_path, table("Logger;TC;TC", "Time;101;102", *(f"{k};2{k},5;{k % 2}" for k in range(5))))
+    assert list(found.columns) == ["101", "102"]
+
+
+def test_more_names_than_columns_are_refused(tmp_path):
+    """The names were lost, and the time was a counter."""
+    with pytest.raises(InputError, match=r"run\.csv:1: 4 names, 3 cells in the rows below; delete"):
+        read(tmp_path, table("Time,T,P,Remark", "0,20.5,1", "1,21.5,2", "2,22.5,3"))

@@ -464,11 +464,18 @@ _COMMAS = "; if the numbers have decimal commas, separate the cells by semicolon
 def _refuse_commas(
     path: Path, head: list[tuple[int, list[str]]], separator: str, width: int, data: list[list[str]]
 ) -> None:
-    """Raise InputError where decimal commas seem to part the numbers: `Time,T` above `0,5,20,5`."""
+    """Raise InputError where decimal commas seem to part the numbers: `Time,T` above `0,5,20,5`.
+
+    Also where there are more names than columns."""
     line, names = head[-1] if head else (0, [])
     whole = all(re.fullmatch(r"[-+]?\d*", c) for row in data for c in row)
-    if separator == "," and whole and 1 < len(names) < width <= 2 * len(names) and all(map(_is_word, names)):
+    words = all(map(_is_word, names))
+    if separator == "," and whole and 1 < len(names) < width <= 2 * len(names) and words:
         raise InputError(f"{path}:{line}: {len(names)} names, {width} cells in the rows below{_COMMAS}")
+    if words and len(names) > width and any(named(n) > 0 for n in names):
+        raise InputError(
+            f"{path}:{line}: {len(names)} names, {width} cells in the rows below; delete the names without a column"
+        )
 
 
 def _is_word(cell: str) -> bool:
@@ -484,6 +491,10 @@ def _header_lines(
 ) -> list[tuple[int, list[str]]]:
     """Return the lines that can be the header, with those of units below it; none without a header."""
     fitting = [(n, c) for n, c in head if _fits(c, width, data)]
+    # `Max;150;10` are no names; those of `Time;101;102` are.
+    fitting = [
+        (n, c) for n, c in fitting if not c[0] or c[0].lower() not in _KINDS or any(map(_is_word, c[1:]))
+    ]
     if traced := [f for f in fitting if f[1][0] == "TraceName"]:
         return traced  # Yokogawa: above its units and rates
     lines_of = ([f for f in fitting if len(f[1]) > 1] or fitting)[-HEAD_LINES:]  # a lone word is a title
