@@ -48,8 +48,9 @@ SECONDS = {symbol: float(size) for symbol, (of, size) in SYMBOLS.items() if of =
 """Seconds of a unit of time."""
 SPELLINGS = {
     "degC": "celsius | °c | ℃ | degc | deg c | deg. c | grad c | degree c | degrees c | degree "
-    "celsius | degrees celsius | deg_c | ºc | ˚c | oc | â°c | �c | c° | º c | grd c",
-    "degF": "fahrenheit | °f | ℉ | degf | deg f | deg. f",
+    "celsius | degrees celsius | deg_c | ºc | ˚c | oc | â°c | �c | c° | º c | grd c "
+    "| degree_c | degrees_c | degree_celsius | degrees_celsius",
+    "degF": "fahrenheit | °f | ℉ | degf | deg f | deg. f | degree_f | degrees_f | degree_fahrenheit",
     "K": "kelvin | °k",
     "deg": "° | grad | degree | degrees",
     "h": "hr | hrs | hour | hours | stunde | stunden | std | heure | heures | hora | horas | ore | "

@@ -405,6 +405,7 @@ TORQUE = "[6071]\nObjectType=7\nDataType=3\n"
     "more,named,words",
     [
         ("[2300]\nParameterName=x\n", ", 0x2300", r"object 0x2300 \(line \d+\) has no DataType"),
+        ("[2300]\nDataType=0x 0003\n", ", 0x2300", r"has DataType=0x 0003, which is no number: correct it"),
         (
             "[6077]\nDataType=3\n[6077]\nDataType=4\n",
             ", 0x6077",

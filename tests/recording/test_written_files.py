@@ -302,7 +302,15 @@ def test_lines_of_names_and_values_with_equals_signs(tmp_path):
 
 @pytest.mark.parametrize(
     "written, unit",
-    [("C°", "degC"), ("º C", "degC"), ("mV DC", "mV"), ("mVDC", "mV"), ("AC V", "V"), ("mA DC", "mA")],
+    [
+        ("C°", "degC"),
+        ("º C", "degC"),
+        ("mV DC", "mV"),
+        ("mVDC", "mV"),
+        ("AC V", "V"),
+        ("mA DC", "mA"),
+        ("degree_C", "degC"),
+    ],
 )
 def test_spellings_of_units_in_round_brackets(tmp_path, written, unit):
     """One that is not known stays in the name, so that nothing refuses mV for V."""

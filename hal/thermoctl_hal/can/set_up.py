@@ -82,10 +82,12 @@ class Objects:
                 f"stands twice with different types (lines {entry.line}, {entry.again.line}): keep one",
             )
         if entry.data_type is None:
+            given = entry.keys.get("datatype")
+            what = (
+                f"DataType={given}, which is no number: correct it in" if given else "no DataType: add it to"
+            )
             raise self._error(
-                item,
-                key,
-                f"(line {entry.line}) has no DataType: add it to the file, as DataType=0x0004 for int32",
+                item, key, f"(line {entry.line}) has {what} the file, as DataType=0x0004 for int32"
             )
         self._check_access(item, key, entry)
         letter = _FORMATS.get(entry.data_type)
