@@ -56,3 +56,28 @@ def test_what_is_no_part_is_refused(folder, capsys, second, says):
     (folder / "b.csv").write_text(second)
     assert cli.main(["recordings", "import", "a.csv", "b.csv", "--out", "ab.parquet"]) == 2
     assert says in capsys.readouterr().err and not (folder / "ab.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    "first, second, good",
+    [
+        ("03/04/2026", "04/04/2026", False),
+        ("03/04/2026", "13/04/2026", True),
+        ("03/04/2026", "04/13/2026", False),
+        ("03/04/2026", "03/04/2026", True),
+        ("2026-04-03", "2026-04-04", True),
+    ],
+)
+def test_files_are_placed_by_dates_that_are_sure(folder, capsys, first, second, good):
+    """A month was a day, or the other way round: the files had another gap between them."""
+    (folder / "a.csv").write_text(f"time,x\n{first} 10:00:00,1\n{first} 10:00:01,2\n")
+    (folder / "b.csv").write_text(f"time,x\n{second} 11:00:00,3\n{second} 11:00:01,4\n")
+    assert cli.main(["recordings", "import", "a.csv", "b.csv", "--out", "ab.parquet"]) == (0 if good else 2)
+    assert good or "day and month cannot be told apart" in capsys.readouterr().err
+
+
+def test_times_without_a_date_have_no_place_among_dates(folder, capsys):
+    (folder / "a.csv").write_text("time,x\n2026-03-14 09:00:00,1\n2026-03-14 09:00:01,2\n")
+    (folder / "b.csv").write_text("time,x\n5,3\n6,4\n")
+    assert cli.main(["recordings", "import", "a.csv", "b.csv", "--out", "ab.parquet"]) == 2
+    assert "b.csv: times without a date beside files with dates" in capsys.readouterr().err

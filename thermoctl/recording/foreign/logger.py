@@ -165,6 +165,23 @@ def _renamed(table: Table, columns: Mapping[str, str]) -> Table:
     return replace(table, columns={n: table.columns[c] for n, c in sources.items()}, units=units)
 
 
+def _refuse_unsure_order(parts: Sequence[Table]) -> None:
+    """Raise InputError where the dates of a file may be two days each, and no other file says which."""
+    read = [
+        (p.path, m)
+        for p in parts
+        for n in p.notes
+        if (m := re.search(r"dates read as ([\w./-]+)( \(or)?", n))
+    ]
+    sure = {m[1] for _, m in read if not m[2]}
+    for path, m in read:
+        if m[2] and sure != {m[1]}:
+            raise InputError(
+                f"{path}: day and month cannot be told apart, and the dates place this file among the others; write "
+                "them as 2026-03-14, or put the rows into one file"
+            )
+
+
 def joined(parts: Sequence[Table]) -> Table:
     """Return several files as one recording, in the order of their times. Raises InputError.
 
@@ -173,6 +190,13 @@ def joined(parts: Sequence[Table]) -> Table:
     starts = [p.meta.get("start") for p in parts]
     if len({str(s).endswith("Z") for s in starts if s}) > 1:
         raise InputError(f"{parts[1].path}: {MIXED}")
+    if any(starts) and not all(starts):
+        without = parts[list(map(bool, starts)).index(False)].path
+        raise InputError(
+            f"{without}: times without a date beside files with dates: nothing says where it begins"
+        )
+    if len({str(s)[:10] for s in starts}) > 1:
+        _refuse_unsure_order(parts)
     if len(parts) > 1 and all(starts):
         offsets = clock.offsets(list(map(str, starts)))
         parts = [replace(p, t=p.t + o) for p, o in zip(parts, offsets, strict=True)]
