@@ -217,6 +217,14 @@ def test_dates_of_further_countries(tmp_path, stamp, start):
     assert found.meta["start"].startswith(start)
 
 
+def test_the_time_in_ms_of_wincc_is_millionths_of_a_day(tmp_path):
+    """Alone, without the TimeString beside it, a second was 0.0116 s."""
+    rows = [f"{46095416666.6667 + 11.574074 * k:.4f};2{k},5" for k in range(3)]
+    found = read(tmp_path, table("Time_ms;T", *rows))
+    np.testing.assert_allclose(found.t, [0, 1, 2], atol=1e-4)
+    assert found.meta["start"].startswith("2026-03-14T10:00")
+
+
 def test_a_year_that_nanoseconds_cannot_hold_is_refused(tmp_path):
     """The last date of a database was a date of our century."""
     for date in ("9999-12-31 23:59:5", "0001-01-01 00:00:0"):

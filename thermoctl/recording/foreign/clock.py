@@ -247,6 +247,7 @@ def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Se
     finite = values[np.isfinite(values)]
     for name, scale, zero, low, high in EPOCHS if len(finite) else ():
         stated = unit is None or abs(SECONDS.get(unit, np.nan) - scale) < 1e-9 * scale
+        stated = stated or ("WinCC" in name and unit == "ms" and bool(np.any(finite % 1)))  # its Time_ms
         unset = int(np.argmax(finite >= low)) if name.startswith("unix") and finite[0] >= 0 else 0
         right = (
             low <= finite[unset:].min()
