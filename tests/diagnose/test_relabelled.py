@@ -82,13 +82,22 @@ def test_pairs_are_refitted_where_the_plant_files_own_values_fit_better(tmp_path
         assert [h for h in better_unfitted(known, pairs) if h is found or not likely] == likely
 
 
-@pytest.mark.parametrize(("gain", "refused"), [(1.79, True), (0.25, True), (1.1, False), (0.7, False)])
-def test_a_gain_that_no_sensor_has_is_a_wrong_column(gain, refused):
+@pytest.mark.parametrize(
+    ("gain", "at_bound", "refused"),
+    [
+        (1.79, {}, True),
+        (0.25, {}, True),
+        (1.1, {}, False),
+        (0.7, {}, False),
+        (0.2, {"A_of_heat": "low"}, False),
+    ],
+)
+def test_a_gain_that_no_sensor_has_is_a_wrong_column(gain, at_bound, refused):
     named = SimpleNamespace(key=("sensor_gain", "heat"), own={"A": "A_of_heat"})
     refitted = SimpleNamespace(parameters={"A_of_heat": SimpleNamespace(value=gain)})
     found = SimpleNamespace(
         shown=(named,),
-        best=SimpleNamespace(plant=refitted),
+        best=SimpleNamespace(plant=refitted, fit=SimpleNamespace(at_bound=at_bound)),
         case=SimpleNamespace(plant=loads(CLOSE, "plant.yaml")),
     )
     told = absurd(found, "run.csv")
