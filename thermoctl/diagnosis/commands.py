@@ -225,7 +225,7 @@ def _print(console: Console, rows: figures.Rows) -> None:
 
 def _next_experiment(entry: Mapping[str, Any], out: Path) -> list[str]:
     lines = [
-        f"next experiment: {entry['profile']}. {entry['why']} {entry['also_helpful'] or ''}",
+        f"next experiment: {entry['profile']}. {entry['why']}",
         *(f"    {line}" for line in peaks(entry)),
     ]
     if worth_running(entry):
