@@ -27,7 +27,7 @@ HEATER = ROOT / "docs/examples/heater"
 COMMANDS = {
     "experiment": (
         ["experiment", "test_1", "--config", "rig.yaml", "--out", "test.parquet"],
-        "moves the output",
+        "",
         "the amplifier is disabled: stopped on request; go on with --resume --out test.parquet",
     ),
     "calibrate": (
@@ -90,6 +90,8 @@ def folder(tmp_path):
 
 def is_begun(name, folder, said):
     """Return whether a command is at work."""
+    if name == "experiment":
+        return (folder / "test.parquet.progress").exists()
     if name == "export":
         return any(folder.glob(".long.csv.*.part"))
     if name == "fleet":  # a process of its cluster has just begun
