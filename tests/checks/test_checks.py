@@ -532,3 +532,26 @@ def test_noise_at_rest_is_no_counter(seed):
     noise = np.random.default_rng(seed).normal(0, 0.1, len(table))
     rest = {**table.columns, "temperature": 21.5 + noise, "heat": np.zeros(len(table))}
     assert "wrapped" not in {f.kind for f in checks(plant, [dataclasses.replace(table, columns=rest)])}
+
+
+BELT = """\
+format: thermoctl-plant/1
+inputs: {u: {unit: N}}
+parameters: {b: {value: 60, unit: N*s/m, range: [20, 200]}, m: {value: 40, unit: kg}, F: {value: 20, unit: N}}
+nodes: {v: {unit: m/s, storage: m, initial: first(y), initial_sigma: 0.02}}
+flows:
+  force: {into: v, rate: u, unit: N}
+  drag: {from: v, rate: b * v, unit: N}
+  deck: {from: v, rate: F * tanh(v / 0.01), unit: N}
+outputs: {y: {value: v, unit: m/s, noise: 0.01}}
+"""
+
+
+def test_friction_at_rest_is_not_the_slowest_time_constant():
+    """At rest, friction holds the belt within 20 ms. Moving, its time constant is 0.7 s."""
+    plant, t = loads(BELT), np.arange(0.0, 40.0, 0.1)
+    u = 80.0 * (t % 20 > 2)
+    table = Table("run", "run", t, {"u": u, "y": np.zeros(len(t))})
+    table = dataclasses.replace(table, columns={"u": u, "y": compile_plant(plant, ()).simulate(table).y[:, 0]})
+    (found,) = [f for f in checks(plant, [table]) if f.kind == "sampling"]
+    assert "slowest" not in found.what and "time in another unit" not in found.suggestion

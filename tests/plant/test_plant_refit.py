@@ -278,3 +278,22 @@ def test_a_stock_that_the_files_values_use_up_before_the_end_is_fitted():
     found = fit_by_first_parts(model, drives)
     assert found.rms()["count"] < 9.5
     assert found.parameters() == pytest.approx({"r": 0.2, "K": 500}, rel=0.1)
+
+
+UNSTABLE = """format: thermoctl-plant/1
+inputs: {u: {unit: N}}
+parameters: {F: {value: 5, unit: N, range: [1, 20]}}
+nodes: {v: {unit: m/s, storage: 1, initial: 0, initial_sigma: 0.01}}
+flows: {push: {into: v, rate: F * tanh(v / 0.01), unit: N}, force: {into: v, rate: u, unit: N}}
+outputs: {y: {value: v, unit: m/s, noise: 0.01}}
+"""
+
+
+@pytest.mark.filterwarnings("error")
+def test_slopes_that_overflow_end_a_refit_by_an_error():
+    """A friction of the wrong sign at rest: the run stays at zero, its slope by the start is exp(500 t)."""
+    t = np.arange(0.0, 5.0, 0.02)
+    model = compile_plant(loads(UNSTABLE))
+    table = Table("a", "a", t, {"u": np.zeros(len(t)), "y": np.zeros(len(t))})
+    with pytest.raises(SimulationError, match="slopes"):
+        fit(model, [model.excitation(table)])

@@ -18,6 +18,7 @@ from thermoctl.plant.simulation.simulate import Excitation, Model, SimulationErr
 
 GROWTH = 1.0  # e-folds over the recording from which an unstable plant cannot follow it
 NYQUIST = np.pi  # sampling interval over time constant from which a mode lies beyond the Nyquist frequency
+ALONG = 9  # number of rows of a run, evenly spaced, at which the slowest time constant is looked for
 SIGMAS = 6.0  # standard deviations of a contradiction: probability 2e-9 for a normal error
 
 
@@ -125,8 +126,26 @@ def _stability(model: Model, excitation: Excitation) -> list[Finding]:
 
 def rates_of(model: Model, excitation: Excitation) -> np.ndarray:
     """Return the plant's eigenvalues at the start, absolute, 1/s; an integrator has none."""
-    rates = np.abs(_eigenvalues(jacobian(model.plant, start_values(model, excitation))))
+    return _rates(model.plant, start_values(model, excitation))
+
+
+def _rates(plant: Plant, values: Mapping[str, float]) -> np.ndarray:
+    rates = np.abs(_eigenvalues(jacobian(plant, values)))
     return rates[rates > 1e-9 * rates.max(initial=0.0)]
+
+
+def _slowest(model: Model, excitation: Excitation) -> float:
+    """Return the largest time constant, s, along the plant's own run: at rest, friction makes it short."""
+    try:
+        x = model.run(excitation).x
+    except SimulationError:
+        x = np.zeros((0, len(model.states)))
+    values, slow = start_values(model, excitation), 1 / rates_of(model, excitation).min()
+    for k in np.linspace(0, len(x) - 1, ALONG).astype(int) if len(x) else ():
+        values |= dict(zip(model.inputs, excitation.u[k], strict=False))
+        values |= dict(zip(model.states, map(float, x[k]), strict=True)) | {"t": float(excitation.t[k])}
+        slow = max(slow, 1 / _rates(model.plant, values).min(initial=np.inf))
+    return float(slow)
 
 
 def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
@@ -137,10 +156,11 @@ def _time_constants(model: Model, excitation: Excitation) -> list[Finding]:
     rates = rates_of(model, excitation)
     if not len(rates):
         return []
-    slow, fast = 1 / rates.min(), 1 / rates.max()
+    fast = 1 / rates.max()
     integrates = len(rates) < len(model.states)
     if step <= NYQUIST * fast:
         return []
+    slow = _slowest(model, excitation)
     none = step > NYQUIST * slow and not integrates
     seen = f"slowest time constant of {slow:.3g} s" if none else f"time constant of {fast:.3g} s"
     ask = (

@@ -284,6 +284,8 @@ class Problem:
             if jacobian:
                 np.add.at(gradient, part.unknowns, part.gradient)
                 matrix[np.ix_(part.unknowns, part.unknowns)] += part.matrix
+        if not np.isfinite(matrix).all():
+            raise SimulationError("the simulation grows too fast: its slopes by the unknowns are no numbers")
         prior_cost, prior_gradient, prior_matrix = self.prior_terms(self.unpack(z)[0], jacobian)
         weight, distance = self.prior(), z - self.z_plant
         cost = cost + prior_cost + float(np.sum(weight * distance**2))
