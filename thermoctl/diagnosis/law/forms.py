@@ -24,6 +24,7 @@ from thermoctl.plant.expression import Expr, name, num
 
 LAW = "law"  # name of a law among the effects of a hypothesis
 MARK = "plant_"  # before a name of the plant in the expressions of a law
+SYMMETRIC = ("product", "powers")  # forms in which the two signals change places
 NEGLIGIBLE = 0.2  # share of its typical size down to which a signal counts as nowhere negative
 
 
@@ -225,7 +226,7 @@ def _pairs(form: Form, z: Signal, every: Sequence[Signal]) -> list[tuple[Signal,
     if form.of not in ("two", "warmed", "gap", "driven", "loaded", "timed", "spent"):
         return [(z,)]
     second = [w for w in every if w != z and not w.daily and (w.drives or form.of != "driven")]
-    return [(z, w) for w in second if form.name != "product" or z.label < w.label]
+    return [(z, w) for w in second if form.name not in SYMMETRIC or z.label < w.label]
 
 
 def combined(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:

@@ -20,6 +20,7 @@ from thermoctl.diagnosis.law.propose import PROPOSALS, Proposal
 from thermoctl.diagnosis.law.smooth import law_unit
 from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import name, num
+from thermoctl.plant.language import Parameter, Plant
 from thermoctl.plant.simulation.simulate import Excitation
 
 FEWEST_REFITS = 3  # least number of refits, if NUMBERS allows fewer because the plant has many bodies
@@ -64,9 +65,25 @@ def refitted_law(
             drives = case.drives_after(plant, before, drives)
             own = {short: long for short, long in c.own_in(plant).items() if short in ranges}
             effects = (*effects, PlacedLaw(dataclasses.replace(c, effect=_bounded(c, ranges)), own, q))
-        return fitted(case, plant, effects, None, leader, parent)
+        f = fitted(case, plant, effects, None, leader, parent)
+        room = _with_room(f, (p, *more))
+        return fitted(case, room, effects, None, leader, parent) if room else f
     except FAILS:
         return None
+
+
+def _with_room(f: Fitted, laws: Sequence[Proposal]) -> Plant | None:
+    """Return the plant with flows that may vanish, where a law takes their place; None if it takes none's.
+
+    The factor of such a flow is held at the lower bound that the plant file states for it."""
+    ends = [{p.place.source, p.place.target} for p in laws if p.place.part == "flow"]
+    rates = [x.rate for x in f.plant.flows.values() if {x.source, x.target} in ends]
+    known, held = f.rough_plant.parameters, dict[str, Parameter]()
+    for q in (q for q, side in f.fit.at_bound.items() if side == "low" and q in known):
+        low, high = known[q].range or (0.0, 0.0)
+        if low > 0 and any(ex.fill(rate, {q: ex.ZERO}) == ex.ZERO for rate in rates):
+            held[q] = dataclasses.replace(known[q], range=(0.0, high))
+    return dataclasses.replace(f.rough_plant, parameters={**known, **held}) if held else None
 
 
 def law_candidate(rig: Rig, p: Proposal) -> Candidate:
