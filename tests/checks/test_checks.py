@@ -552,6 +552,8 @@ def test_friction_at_rest_is_not_the_slowest_time_constant():
     plant, t = loads(BELT), np.arange(0.0, 40.0, 0.1)
     u = 80.0 * (t % 20 > 2)
     table = Table("run", "run", t, {"u": u, "y": np.zeros(len(t))})
-    table = dataclasses.replace(table, columns={"u": u, "y": compile_plant(plant, ()).simulate(table).y[:, 0]})
+    table = dataclasses.replace(
+        table, columns={"u": u, "y": compile_plant(plant, ()).simulate(table).y[:, 0]}
+    )
     (found,) = [f for f in checks(plant, [table]) if f.kind == "sampling"]
     assert "slowest" not in found.what and "time in another unit" not in found.suggestion

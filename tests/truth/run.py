@@ -56,8 +56,11 @@ def diagnose(job: Job, out: str) -> Run:
 
 def _result(job: Job, path: Path) -> dict[str, Any]:
     found = sought(job, limits())
-    _keep(found, path)
     diagnosis = engine.decided(found)
+    if engine.undecided(diagnosis, job.held_out):
+        found = sought(job, limits(), False)
+        diagnosis = engine.decided(found)
+    _keep(found, path)
     if wrong := relabelled(diagnosis):
         raise InputError(str(wrong[0]))
     save(diagnosis.plant, path.with_name("plant.yaml"))
@@ -65,11 +68,11 @@ def _result(job: Job, path: Path) -> dict[str, Any]:
     return contract(diagnosis)
 
 
-def sought(job: Job, numbers: Thresholds) -> engine.Sought:
-    """Return the search of a job. Raises InputError, SimulationError."""
+def sought(job: Job, numbers: Thresholds, aside: bool = True) -> engine.Sought:
+    """Return the search of a job; `aside` as in the engine. Raises InputError, SimulationError."""
     plant = load(job.plant)
     tables, apart = (read_recordings(plant, files) for files in (job.recordings, job.held_out))
-    return engine.sought(plant, tables, catalogue((CATALOGUE,)), numbers, apart)
+    return engine.sought(plant, tables, catalogue((CATALOGUE,)), numbers, apart, aside=aside)
 
 
 def _keep(sought: engine.Sought, path: Path) -> None:

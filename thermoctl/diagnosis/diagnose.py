@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from thermoctl.checks.hung import without_hung
 from thermoctl.diagnosis.data.case import Budget, Case, case
@@ -65,9 +66,20 @@ def diagnose(
     Once `stopped`, the search ends after the present refit, and no law is looked for. `memory`: the posterior
     of earlier recordings."""
     say = progress or (lambda text: None)
-    tried = sought(plant, tables, entries, numbers, held_out, say, stopped, memory)
-    say("measuring what the findings are worth")
-    return decided(tried)
+
+    def found(aside: bool) -> Diagnosis:
+        """Search and decide, with the last recording set aside or with all of them."""
+        tried = sought(plant, tables, entries, numbers, held_out, say, stopped, memory, aside)
+        say("measuring what the findings are worth")
+        return decided(tried)
+
+    first = found(True)
+    return found(False) if undecided(first, held_out) and not stopped() else first
+
+
+def undecided(found: Diagnosis, held_out: Sequence[Any]) -> bool:
+    """Return whether a recording that nobody wanted aside may tell what the others cannot."""
+    return found.decision.verdict == "ambiguous" and found.worth.reserved and not held_out
 
 
 def sought(
@@ -79,11 +91,15 @@ def sought(
     say: Callable[[str], None] = lambda text: None,
     stopped: Callable[[], bool] = lambda: False,
     memory: Memory = NOTHING,
+    aside: bool = True,
 ) -> Sought:
-    """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError."""
+    """Try the hypotheses. The arguments are those of `diagnose`. Raises InputError.
+
+    `aside`: of three or more recordings the last one takes no part in any choice."""
     say("refitting the plant's own parameters")
     given, hung = without_hung(plant, [*tables, *held_out])
-    both = split(given[: len(tables)], given[len(tables) :])
+    both = given[: len(tables)], given[len(tables) :]
+    both = split(*both) if aside else both
     (chosen_on, notes), (reserve, more) = (in_pieces(plant, part) for part in both)
     plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]

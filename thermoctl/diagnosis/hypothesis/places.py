@@ -212,8 +212,12 @@ def _lengths(rig: Rig) -> list[Place]:
 
 
 def _members(rig: Rig) -> Iterator[Place]:
+    """Yield the bodies whose growth a displacement lacks, not those whose growth it has with a free size."""
+    free = {q for q, p in rig.plant.parameters.items() if p.range}
     for displacement in _lengths(rig):
         for node in rig.signals("T"):
+            if ex.names(ex.derivative(displacement.symbols["y"], node)) & free:
+                continue
             yield Place(node, {**displacement.symbols, "T": name(node)}, output=displacement.output)
 
 
