@@ -14,6 +14,7 @@ from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.evidence.fit import closest, with_residuals
 from thermoctl.diagnosis.evidence.held_out import cleaned, split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
+from thermoctl.diagnosis.evidence.steady import steady
 from thermoctl.diagnosis.evidence.unknown import left, reached
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
@@ -104,7 +105,12 @@ def sought(
     plant = with_free_starts(plant, [*chosen_on, *reserve]) if notes or more else plant
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
-    known = between(plant, lambda p: case(p, chosen_on, entries, budget, memory, numbers))
+
+    def made(tables: Sequence[Table]) -> Case:
+        """Return the case of recordings."""
+        return between(plant, lambda p: case(p, tables, entries, budget, memory, numbers))
+
+    known, reserve = steady(made(chosen_on), made, reserve)
     known.notes.extend([*hung, *notes, *more])
     found = searched(with_laws(search(known)))
     return Sought(known, found, tuple(reserve), stopped() and bool(known.budget.untried))

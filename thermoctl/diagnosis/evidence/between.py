@@ -45,8 +45,8 @@ def between(plant: Plant, made: Callable[[Plant], Case]) -> Case:
     if past.recordings:
         return made(dataclasses.replace(plant, inputs=inputs))
     try:
-        held, straight = _alone(case), _alone(case, dataclasses.replace(case.plant, inputs=inputs))
-        if straight <= held + CLEARLY or _alone(case, _early(case, [i.name for i in loose])) > straight:
+        held, straight = alone(case), alone(case, dataclasses.replace(case.plant, inputs=inputs))
+        if straight <= held + CLEARLY or alone(case, _early(case, [i.name for i in loose])) > straight:
             return case
     except FAILS:
         return case
@@ -76,7 +76,7 @@ def _early(case: Case, inputs: Sequence[str]) -> Plant:
     return dataclasses.replace(plant, flows=flows, outputs=outputs)
 
 
-def _alone(case: Case, plant: Plant | None = None) -> float:
+def alone(case: Case, plant: Plant | None = None) -> float:
     """Return the log evidence of the case's plant, or of another one, without effects.
 
     Raises SimulationError; InputError for a delay within a delay."""

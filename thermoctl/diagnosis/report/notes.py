@@ -43,7 +43,7 @@ def notes(d: Diagnosis) -> list[str]:
         ),
         *filter(None, [d.unknown]),
         *(
-            f"{effect} at {where} is over within {BRIEF} rows: a switch that is logged early or late looks the same"
+            f"{effect} at {where} may be over within {BRIEF} rows: a switch that is logged early or late looks the same"
             for effect, where in sorted(d.refused)
             if any(brief(w.fitted, (effect, where)) for w in d.searched.tried)
         ),

@@ -119,7 +119,7 @@ class Search:
                     self.tried[keys] = Weighed(w.fitted, odds)
 
     def extended(self, parent: Weighed) -> list[Weighed]:
-        """Extend a hypothesis, once."""
+        """Extend a hypothesis, once; by nothing where its plant has no responses."""
         if parent.fitted.hypothesis.keys in self.seen:
             return []
         if self.case.budget.spent:
@@ -127,7 +127,10 @@ class Search:
             return []
         self.seen.add(parent.fitted.hypothesis.keys)
         self.case.budget.screen()
-        looked = screened(self.case, parent.fitted, self.known)
+        try:
+            looked = screened(self.case, parent.fitted, self.known)
+        except FAILS:
+            return []
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
         for d, gain in looked.promised:

@@ -145,11 +145,14 @@ def timed(f: Fitted, key: Key) -> Candidate | None:
 
 
 def brief(f: Fitted, key: Key) -> bool:
-    """Return whether an effect is over within BRIEF rows: so is the error of a switch logged early."""
+    """Return whether an effect may be over within BRIEF rows: so is the error of a switch logged early.
+
+    Its size and its length may replace each other: so the least length counts, by two standard errors."""
     for e in (e for e in f.hypothesis.effects if e.key == key):
         ends = [e.own[p.name] for p in e.candidate.effect.parameters if p.shape in ENDS]
         times = [f.plant.parameters[q].value for q in ends]
-        return len(times) == len(ENDS) and times[1] - times[0] <= BRIEF * e.candidate.rig.sample
+        unsure = 2 * sum(f.sd.get(q, 0.0) for q in ends)
+        return len(times) == len(ENDS) and times[1] - times[0] - unsure <= BRIEF * e.candidate.rig.sample
     return False
 
 
