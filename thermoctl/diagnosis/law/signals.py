@@ -187,7 +187,7 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs.
 
     A node that is linked to the place only through two or more others is no signal: it acts through these.
-    The error of a reading depends on what is read."""
+    The error of a reading depends on what is read. A storage depends on states, not on inputs."""
     p, out = rig.physics, []
     if place.part == "reading":
         o = p.outputs[place.target]
@@ -206,11 +206,12 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
             out.append(_between(rig, place, place.target, n))
     clocks = {i for i, q in p.inputs.items() if q.role == "time_of_day"}
     for i in sorted(rig.moving_inputs - clocks):
-        if i != rig.air and not i.endswith("_start"):
+        if not i.endswith("_start"):
             out.append(_absolute(rig, place, i, p.inputs[i].unit))
     out += [Signal(c, name(c), None, recorded=True) for c in rig.spare if not _follows(c, p, runs)]
     sized = [_sized(s, runs) for s in out] + [_daily(i, p.inputs[i].unit, runs) for i in sorted(clocks)]
-    return [s for s in sized if s is not None]
+    barred = {*p.inputs} if place.part == "storage" else set[str]()
+    return [s for s in sized if s is not None and not ex.names(s.value) & barred]
 
 
 def rates(plant: Plant, place: Place, runs: Sequence[Values], beside: Sequence[Signal]) -> list[Signal]:
