@@ -66,6 +66,13 @@ def test_heat_that_copper_makes_may_go_elsewhere_and_what_a_draught_carries_off_
     assert set(offered(*motor, "heat_split")) == {"winding-housing"}
 
 
+def test_a_member_whose_growth_a_displacement_has_with_a_free_size_is_not_missing(motor):
+    """A gauge that is zeroed anew between two recordings was one, above 0.99: its memory of the start is an offset."""
+    assert set(offered(*motor, "missing_member")) == {"winding", "air"}
+    plant = loads(MOTOR.replace(", range: [0.5, 8]", ""))
+    assert set(offered(plant, motor[1], "missing_member")) == {"winding", "air", "housing"}
+
+
 def test_a_reading_of_growth_may_follow_the_air_as_a_temperature_does(motor):
     assert set(offered(*motor, "cold_junction_drift")) == {"winding_c", "housing_c", "error"}
 

@@ -110,7 +110,7 @@ def sought(
         """Return the case of recordings."""
         return between(plant, lambda p: case(p, tables, entries, budget, memory, numbers))
 
-    known, reserve = steady(made(chosen_on), made, reserve)
+    known, reserve = steady(made(chosen_on), made, chosen_on, reserve)
     known.notes.extend([*hung, *notes, *more])
     found = searched(with_laws(search(known)))
     return Sought(known, found, tuple(reserve), stopped() and bool(known.budget.untried))

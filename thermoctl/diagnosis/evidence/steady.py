@@ -2,81 +2,130 @@
 
 A simulation is driven by what was read: a mass integrates the noise of a current's reading. Functions of the
 reading that are flat at each level take this noise away, and predict every part better: a limit, a dead zone,
-a law with its edges at the levels (regression dilution). So the mean of each level is tried as the input."""
+a law with its edges at the levels (regression dilution). So the mean of each level is tried as the input. The
+mean has an error, too: it is fitted to the outputs, with its own standard error as the prior."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.between import CLEARLY, alone
-from thermoctl.diagnosis.report.words import listed
 from thermoctl.files.yamlfile import InputError
+from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import SimulationError
 from thermoctl.recording.table import Table
 
 STEP = 8.0  # difference of two rows over the noise from which it is a step: chance 2e-8 without one
 LEVEL = 10  # least number of rows of a level
-SAME = 4.0  # standard errors of a difference of two means below which they are one level
 MOST = 0.8  # least share of the rows that lie in levels
+SAME = 4.0  # standard errors of a difference of two means below which they are one level
 # Least ratio of von Neumann (1941), 2 for white noise: below it, the input moves within its levels. In 120
 # recordings of rigs and generated cases no moving input has more than 1.04.
 WHITE = 1.5
+ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The levels of an input: by recording the number of the level in each row (N,), -1 for none.
+
+    `values`, `sd` (levels,): their means and standard errors."""
+
+    of: list[np.ndarray]
+    values: np.ndarray
+    sd: np.ndarray
+
+    def read(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return readings (N,) by recording with each level in place of those at it."""
+        return [np.where(k >= 0, self.values[k], x) for k, x in zip(self.of, columns, strict=True)]
 
 
 def steady(
-    case: Case, made: Callable[[Sequence[Table]], Case], reserve: Sequence[Table]
+    case: Case, made: Callable[[Sequence[Table]], Case], tables: Sequence[Table], reserve: Sequence[Table]
 ) -> tuple[Case, list[Table]]:
-    """Return the case, and the recordings set aside, with the means of levels as inputs where they fit clearly better.
+    """Return the case, and the recordings set aside, with levels as inputs where the plant alone fits clearly better.
 
     `made`: makes the case of recordings. Else both as they are. Raises InputError."""
-    given = [*case.tables, *reserve]
-    of_columns = {
-        c: levels([t.columns[c] for t in given]) for c in {i.column for i in case.plant.inputs.values()}
-    }
-    found = {c: v for c, v in of_columns.items() if v}
+    given, n = [*tables, *reserve], len(tables)
+    columns = {i.column for i in case.plant.inputs.values()}
+    found = {c: v for c in sorted(columns) if (v := levels([t.columns[c] for t in given]))}
     if not found or case.memory.recordings:
         return case, list(reserve)
-    tables = [
-        replace(t, columns={**t.columns, **{c: v[k] for c, v in found.items()}}) for k, t in enumerate(given)
-    ]
     try:
-        other = made(tables[: len(case.tables)])
+        for _ in range(ROUNDS):
+            other = made(_driven(given, found)[:n])
+            found = _fitted(other, given[:n], found)
+        again = _driven(given, found)
+        other = made(again[:n])
         gain = alone(other) - alone(case)
     except (InputError, SimulationError, np.linalg.LinAlgError):
         return case, list(reserve)
     if gain <= CLEARLY:
         return case, list(reserve)
     other.notes.append(
-        f"the readings of {listed(sorted(found))} scatter about levels; with the mean of each level the plant alone follows the recordings "
+        f"the readings of {', '.join(found)} scatter about levels; with these levels the plant alone follows the recordings "
         f"better ({gain:.0f} nats): taken so"
     )
-    return other, tables[len(case.tables) :]
+    return other, again[n:]
 
 
-def levels(columns: Sequence[np.ndarray]) -> list[np.ndarray] | None:
-    """Return the mean of its level for each reading (N,) by recording.
+def _driven(tables: Sequence[Table], found: Mapping[str, Levels]) -> list[Table]:
+    read = {c: v.read([t.columns[c] for t in tables]) for c, v in found.items()}
+    return [
+        replace(t, columns={**t.columns, **{c: v[k] for c, v in read.items()}}) for k, t in enumerate(tables)
+    ]
 
-    None where one of them is not driven in levels, with white noise. Readings between levels stay."""
+
+def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) -> dict[str, Levels]:
+    """Return the levels after a step to the outputs' errors at the case's refit. Raises SimulationError."""
+    model, fit, out = case.null.model, case.null, dict(found)
+    sigma = np.array([s.sigma for s in fit.noise])
+
+    def errors(changed: Mapping[str, Levels]) -> np.ndarray:
+        """Return the errors of all outputs over their noise (rows,)."""
+        problem = Problem(model, [model.excitation(t) for t in _driven(tables, changed)], fit.noise)
+        rows = [problem.errors(r, fit.values[r], fit.dx0[r]) / sigma for r in range(len(tables))]
+        return np.nan_to_num(np.concatenate(rows).ravel())
+
+    now = errors(found)
+    for column, v in found.items():
+        moved = [replace(v, values=v.values + v.sd * (np.arange(len(v.sd)) == k)) for k in range(len(v.sd))]
+        slopes = np.stack([errors({**found, column: m}) - now for m in moved], axis=1)
+        step = np.linalg.solve(slopes.T @ slopes + np.eye(len(v.sd)), -slopes.T @ now)
+        out[column] = replace(v, values=v.values + v.sd * step)
+    return out
+
+
+def levels(columns: Sequence[np.ndarray]) -> Levels | None:
+    """Return the levels of an input (N,) by recording; None where one of them is not driven so, with white noise.
+
+    A level that comes again is one. Short parts that fit none, as between two levels, have none."""
     x, first = np.concatenate(columns), np.cumsum([len(c) for c in columns])[:-1]
     d = np.diff(x)
     noise = 1.4826 * float(np.median(np.abs(d))) / np.sqrt(2) if len(d) else 0.0
     if not (np.isfinite(x).all() and noise > 0):
         return None
     ends = np.union1d(np.flatnonzero(np.abs(d) > STEP * noise) + 1, first)
-    parts = [p for p in np.split(np.arange(len(x)), ends) if len(p) >= LEVEL]
-    if sum(map(len, parts)) < MOST * len(x):
+    parts = sorted(np.split(np.arange(len(x)), ends), key=lambda p: x[p].mean())
+    long = [p for p in parts if len(p) >= LEVEL]
+    if sum(map(len, long)) < MOST * len(x):
         return None
-    scatter = sum(float(np.var(x[p]) * (len(p) - 1)) for p in parts)
-    if sum(float(np.sum(np.diff(x[p]) ** 2)) for p in parts) <= WHITE * scatter:
+    scatter = sum(float(np.var(x[p]) * (len(p) - 1)) for p in long)
+    if sum(float(np.sum(np.diff(x[p]) ** 2)) for p in long) <= WHITE * scatter:
         return None
-    out, level = x.copy(), np.zeros(0, int)
-    for p in sorted(parts, key=lambda p: x[p].mean()):  # a level that comes again is one
-        error = noise * np.sqrt(1 / len(p) + 1 / max(len(level), 1))
-        again = len(level) and x[p].mean() - x[level].mean() < SAME * error
-        level = np.append(level, p) if again else p
-        out[level] = x[level].mean()
-    return np.split(out, first)
+    groups = [long[0]]
+    for p in long[1:]:
+        own = groups[-1]
+        again = x[p].mean() - x[own].mean() < SAME * noise * np.sqrt(1 / len(p) + 1 / len(own))
+        groups[-1:] = [np.append(own, p)] if again else [own, p]
+    values = np.array([x[p].mean() for p in groups])
+    of = np.full(len(x), -1)
+    for p in parts:
+        k = int(np.argmin(np.abs(values - x[p].mean())))
+        if len(p) >= LEVEL or abs(values[k] - x[p].mean()) < SAME * noise / np.sqrt(len(p)):
+            of[p] = k
+    return Levels(np.split(of, first), values, noise / np.sqrt([len(p) for p in groups]))

@@ -216,7 +216,7 @@ def _members(rig: Rig) -> Iterator[Place]:
     free = {q for q, p in rig.plant.parameters.items() if p.range}
     for displacement in _lengths(rig):
         for node in rig.signals("T"):
-            if ex.names(ex.derivative(displacement.symbols["y"], node)) & free:
+            if ex.names(ex.derivative(ex.undelayed(displacement.symbols["y"]), node)) & free:
                 continue
             yield Place(node, {**displacement.symbols, "T": name(node)}, output=displacement.output)
 
