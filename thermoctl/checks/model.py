@@ -129,7 +129,7 @@ def rates_of(model: Model, excitation: Excitation) -> np.ndarray:
     return _rates(model.plant, start_values(model, excitation))
 
 
-def _rates(plant: Plant, values: Mapping[str, float]) -> np.ndarray:
+def _rates(plant: Plant, values: dict[str, float]) -> np.ndarray:
     rates = np.abs(_eigenvalues(jacobian(plant, values)))
     return rates[rates > 1e-9 * rates.max(initial=0.0)]
 
