@@ -16,7 +16,7 @@ from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.search import beam, shortlist
 from thermoctl.diagnosis.search.beam import Search, Weighed, grow
 from thermoctl.plant import loads
-from thermoctl.plant.simulation.simulate import compile_plant
+from thermoctl.plant.simulation.simulate import SimulationError, compile_plant
 from thermoctl.recording.table import Table
 
 PLACE = "somewhere"
@@ -221,3 +221,14 @@ def test_an_effect_that_is_nothing_is_not_ahead_of_a_worse_refit_of_the_others()
     assert rest.fitted.hypothesis.keys == {("coulomb_friction", "velocity")} and rest.score > s.best.score
     s.keep([rest])
     assert not beam.cleared(s)
+
+
+def test_a_hypothesis_whose_responses_cannot_be_simulated_is_not_extended(monkeypatch):
+    """Two of sixteen real rigs lost their diagnosis, though the plant alone could be refitted."""
+
+    def failed(*_: object) -> None:
+        raise SimulationError("run_2: the plant cannot be simulated")
+
+    s = beam.started(rubbed())
+    monkeypatch.setattr(beam, "screened", failed)
+    assert s.extended(s.best) == [] and s.best.fitted.hypothesis.keys == frozenset()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report import notes
 from thermoctl.diagnosis.verdict.confirm import Confirm
+from thermoctl.plant import expression as ex
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -178,3 +180,39 @@ def test_a_missing_spring_is_named_though_swings_set_aside_start_fast(k):
     found = diagnose(loads(linear), tables, entries, limits(), [swing(SWINGS[k], 10 + k)])
     assert [e.key[0] for e in found.shown] == ["cubic_stiffness"]
     assert found.decision.verdict == "explained" and not found.case.outliers
+
+
+WINDER = """\
+format: thermoctl-plant/1
+title: A winder that turns one way
+inputs: {volts: {unit: V}}
+parameters:
+  k: {value: 0.08, unit: N*m/V, range: [0.02, 0.3]}
+  b: {value: 0.003, unit: N*m*s/rad, range: [0.0008, 0.01]}
+  J: {value: 0.01, unit: kg*m**2}
+nodes: {w: {unit: rad/s, storage: J, initial: first(tacho), initial_sigma: 0.5, role: velocity}}
+flows:
+  motor: {into: w, rate: k * volts, unit: N*m}
+  drag: {from: w, rate: b * w, unit: N*m}
+outputs: {tacho: {value: w, unit: rad/s, noise: 0.5}}
+"""
+
+
+def test_a_recording_that_was_set_aside_decides_where_the_others_do_not():
+    """The recording of the proposed experiment was the third one, took no part, and the answer stayed ambiguous."""
+    plant, t, runs = loads(WINDER), np.arange(0, 40, 0.05), []
+    rubs = plant.flows["drag"]
+    rubs = replace(rubs, rate=ex.parse("b * w + 0.15 * tanh(w / 0.5)"))
+    truth = compile_plant(replace(plant, flows={**plant.flows, "drag": rubs}))
+    for seed, sign in ((1, 1), (2, 1), (3, -1)):
+        levels = np.repeat(np.random.default_rng(seed).uniform(5, 20, 10), 80)
+        drive = {"volts": np.where(t < 20, levels, sign * levels), "tacho": np.full(len(t), 100.0)}
+        runs.append(truth.measure(Table(f"run_{seed}", "", t, drive), seed))
+    friction = {"coulomb_friction", "constant_load"}
+    entries = {k: e for k, e in catalogue().items() if k in friction}
+    first = diagnose(plant, runs[:2], entries, limits())
+    assert first.decision.verdict == "ambiguous"
+    found = diagnose(plant, runs, entries, limits())
+    assert found.decision.named == (("coulomb_friction", "w"),) and not found.worth.reserved
+    aside = diagnose(plant, runs[:2], entries, limits(), runs[2:])
+    assert aside.worth.reserved, "a recording that --held-out names stays aside"

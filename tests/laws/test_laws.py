@@ -1007,3 +1007,45 @@ def test_a_schedule_of_the_day_and_what_wears_change_a_flow(rate, form, signals,
     assert {s.label for x in law.proposal.terms for s in x.signals} == signals
     values = law.fitted.plant.parameters
     assert {q: values[f"{q}_law_one"].value for q in shapes} == pytest.approx(shapes, abs=0.02)
+
+
+COOLER = """\
+format: thermoctl-plant/1
+title: Oil cooler, its conductance as a constant
+inputs: {heater: {unit: W}, flow: {unit: kg/s}, inlet: {unit: degC}}
+parameters:
+  C: {value: 9000, unit: J/K, range: [3000, 30000]}
+  G: {value: 300, unit: W/K, range: [90, 900]}
+nodes:
+  oil: {unit: degC, storage: C, initial: first(oil_t), initial_sigma: 0.1}
+  water: {unit: degC, storage: 4000, initial: first(water_t), initial_sigma: 0.1}
+flows:
+  heat: {into: oil, rate: heater, unit: W}
+  wall: {from: oil, into: water, rate: G * (oil - water), unit: W}
+  carry: {from: water, rate: flow * 4180 * (water - inlet), unit: W}
+outputs:
+  oil_t: {value: oil, unit: degC, noise: 0.1}
+  water_t: {value: water, unit: degC, noise: 0.1}
+"""
+
+
+def test_a_law_takes_the_place_of_a_flow_whose_range_ends_above_zero():
+    """The conductance goes with flow^0.6. A second term had to undo G = 90, which the plant file's range keeps."""
+    plant, t = loads(COOLER), np.arange(0, 4000, 5.0)
+    rng = np.random.default_rng(5)
+    steps = [np.repeat(rng.uniform(a, b, 20), 40) for a, b in ((0, 6000), (0.06, 0.4))]
+    drive = {"heater": steps[0], "flow": steps[1], "inlet": np.full(len(t), 15.0)}
+    drive |= {"oil_t": np.full(len(t), 40.0), "water_t": np.full(len(t), 20.0)}
+    wall = replace(plant.flows["wall"], rate=ex.parse("2.9 * G * flow**0.6 * (oil - water)"))
+    truth = compile_plant(replace(plant, flows={**plant.flows, "wall": wall}))
+    known = case(plant, [truth.measure(Table("run", "", t, drive), 1)], {}, Budget(80))
+    null = fitted(known, plant, (), known.null)
+    led = [p for p in propose_laws(known, null, limits()) if p.place == Place("water", "oil")]
+    (p,) = [p for p in led if [x.form.name for x in p.terms] == ["product"]]
+    form = next(f for f in library() if f.name == "power_product")
+    p = replace(p, terms=(replace(p.terms[0], form=form, shapes={"n": 0.8}),))
+    f = refitted_law(known, null, p, null)
+    assert f.plant.parameters["G"].value < 30 and f.plant.parameters["G"].range == (0.0, 900.0)
+    exponent = laws_of(f)[0].own["n1"]
+    assert f.plant.parameters[exponent].value == pytest.approx(0.6, abs=3 * f.sd[exponent] + 0.02)
+    assert f.sd[exponent] < 0.03

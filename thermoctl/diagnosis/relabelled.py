@@ -142,7 +142,7 @@ def _misfit(case: Case, f: Fitted) -> float:
 def absurd(found: Diagnosis, where: str) -> list[Finding]:
     """Return a finding for each named gain that no real sensor has.
 
-    A gain at a bound of its range is no measurement: what it stands for was not found."""
+    A gain at a bound of its range is no measurement: it stands for another fault."""
     findings = []
     for e in found.shown:
         if e.key[0] != GAIN or SIZE not in e.own or e.own[SIZE] in found.best.fit.at_bound:

@@ -1,9 +1,9 @@
 """Inputs that are driven in levels, whose readings scatter about them.
 
-A simulation is driven by what was read: a mass integrates the noise of a current's reading. Functions of the
-reading that are flat at each level take this noise away, and predict every part better: a limit, a dead zone,
-a law with its edges at the levels (regression dilution). So the mean of each level is tried as the input. The
-mean has an error, too: it is fitted to the outputs, with its own standard error as the prior."""
+A simulation is driven by readings: a mass integrates the noise of a current's reading. A function of the
+reading that is flat at each level takes this noise away, and predicts every part better. A limit, a dead zone
+and a law with its edges at the levels do so. So the mean of each level is tried as the input. The mean has an
+error, too: it is fitted to the outputs, with its own standard error as the prior."""
 
 from __future__ import annotations
 
@@ -47,9 +47,10 @@ class Levels:
 def steady(
     case: Case, made: Callable[[Sequence[Table]], Case], tables: Sequence[Table], reserve: Sequence[Table]
 ) -> tuple[Case, list[Table]]:
-    """Return the case, and the recordings set aside, with levels as inputs where the plant alone fits clearly better.
+    """Return the case and the recordings set aside, with levels as inputs or as they are.
 
-    `made`: makes the case of recordings. Else both as they are. Raises InputError."""
+    Levels are taken where the plant alone fits clearly better with them. `made`: makes the case of
+    recordings. Raises InputError."""
     given, n = [*tables, *reserve], len(tables)
     columns = {i.column for i in case.plant.inputs.values()}
     found = {c: v for c in sorted(columns) if (v := levels([t.columns[c] for t in given]))}
@@ -101,7 +102,7 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
 
 
 def levels(columns: Sequence[np.ndarray]) -> Levels | None:
-    """Return the levels of an input (N,) by recording; None where one of them is not driven so, with white noise.
+    """Return the levels of an input (N,) by recording; None where it is not driven so, or moves within.
 
     A level that comes again is one. Short parts that fit none, as between two levels, have none."""
     x, first = np.concatenate(columns), np.cumsum([len(c) for c in columns])[:-1]

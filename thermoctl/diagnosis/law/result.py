@@ -106,12 +106,16 @@ def described(p: Proposal, f: Fitted) -> str:
 
 
 def wrong_ends(case: Case, law: FoundLaw) -> list[str]:
-    """Return a sentence for a flow of the plant that the law only leads to, or takes from, another node."""
+    """Return a sentence for a flow of the plant that the law only leads to, or takes from, another node.
+
+    The law reads the signals of the flow then: near a balance, flows of other signals are as large."""
     place, model = law.proposal.place, law.fitted.fit.model
     drives = case.drives(model)
     own, out = law_rate(law.fitted, law.placed), []
     for f in model.plant.flows.values():
         if not place.source or (f.target == place.source) == (f.source == place.target):
+            continue
+        if not ex.names(f.rate) - model.plant.parameters.keys() <= ex.names(own):
             continue
         moved, whole = [], []
         for d, names in zip(drives, along(law.fitted.fit, drives), strict=True):

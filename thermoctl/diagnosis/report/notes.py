@@ -79,18 +79,15 @@ def _differ(d: Diagnosis) -> list[str]:
 def _at_bounds(d: Diagnosis) -> list[str]:
     """Return a sentence where values end at bounds that the plant file may have set too narrow.
 
-    A bound of zero is physics: a flow that is not there."""
-    known, ends = d.case.plant.parameters, list[str]()
-    for q, side in d.final.fit.at_bound.items():
-        low, high = (known[q].range if q in known else None) or (0.0, 0.0)
-        bound = low if side == "low" else high
-        if bound:
-            ends.append(f"{q} ({bound:g})")
-    if not ends:
-        return []
-    return [
-        f"at a bound of the range in the plant file: {listed(ends)}; the truth may lie beyond, and what was found may stand for that"
-    ]
+    A bound of zero is physics: a flow that is not there. A law may take a flow's place below its bound."""
+    known, now = d.case.plant.parameters, d.final.plant.parameters
+    ranges = {q: now[q].range or (0.0, 0.0) for q in known if q in now}
+    bounds = {q: ranges[q][side == "high"] for q, side in d.final.fit.at_bound.items() if q in ranges}
+    ends = [f"{q} ({bound:g})" for q, bound in bounds.items() if bound]
+    below = [f"{q} ({now[q].value:.3g})" for q in ranges if ranges[q] < (known[q].range or (0.0, 0.0))]
+    beyond = f"at a bound of the range in the plant file: {listed(ends)}; the truth may lie beyond, and what was found may stand for that"
+    instead = f"below the range in the plant file: {listed(below)}; the law takes the place of the flow in proportion to it"
+    return [*([beyond] if ends else []), *([instead] if below else [])]
 
 
 def unfinished(*fits: Fitted) -> list[str]:
