@@ -199,7 +199,8 @@ def _memories(plant: Plant, trajectory: dict[str, Any], t: np.ndarray) -> dict[s
 
 def _variables(law: FoundLaw, made: Made) -> set[str]:
     """The signals of the terms that matter, without the ambient."""
-    run = _signals(made.plant, made.tables[0])
+    known = {q: p.value for q, p in made.plant.parameters.items()}  # a flow of the plant file is a signal, too
+    run = {**known, **_signals(made.plant, made.tables[0])}
     sizes, out, at = [], set(), 0
     for k, t in enumerate(law.proposal.terms):
         flow = t.values(run, run["t"]) @ np.array(law.proposal.sizes[at : at + len(t.form.sizes)])
@@ -208,7 +209,7 @@ def _variables(law: FoundLaw, made: Made) -> set[str]:
     for k, size in sizes:
         if size >= PART * max(s for _, s in sizes):
             out |= {n for s in law.proposal.terms[k].signals for n in ex.names(s.value)}
-    return out - AMBIENT
+    return out - AMBIENT - known.keys()
 
 
 def table(lines: Sequence[dict[str, Any]]) -> str:

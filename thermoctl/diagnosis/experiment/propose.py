@@ -172,8 +172,8 @@ def survivors(diagnosis: Diagnosis) -> list[Standing]:
             (fits[k], p, " and ".join(spoken(k)) or "the plant as it is") for k, p in hypotheses.items()
         ]
     elif law := diagnosis.law:
-        laws = ((law.proposal, law.fitted, law.share), *law.rivals)
-        likely = [(f, share, described(p, f)) for p, f, share in laws]
+        likely = [(law.fitted, law.share, f"the law found at {law.proposal.place.where}")]
+        likely += [(f, share, described(p, f)) for p, f, share in law.rivals]
     else:
         return []
     likely.sort(key=lambda x: -x[1])
