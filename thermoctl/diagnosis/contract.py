@@ -100,7 +100,7 @@ def _fit(d: Diagnosis) -> dict[str, Any]:
         "held_out_after": d.worth.after if d.extends else d.worth.refit_only,
         "held_out": "recordings " + ", ".join(d.worth.names)
         if d.worth.reserved
-        else "cross-validated: too few recordings to set one aside",
+        else "cross-validated: no recording is set aside",
     }
 
 

@@ -75,7 +75,10 @@ def diagnose(
         return decided(tried)
 
     first = found(True)
-    return found(False) if undecided(first, held_out) and not stopped() else first
+    if stopped() or not undecided(first, held_out):
+        return first
+    say("the recording set aside takes part: the others do not decide")
+    return found(False)
 
 
 def undecided(found: Diagnosis, held_out: Sequence[Any]) -> bool:
