@@ -199,7 +199,9 @@ def _memories(plant: Plant, trajectory: dict[str, Any], t: np.ndarray) -> dict[s
 
 def _variables(law: FoundLaw, made: Made) -> set[str]:
     """The signals of the terms that matter, without the ambient."""
-    known = {q: p.value for q, p in made.plant.parameters.items()}  # a flow of the plant file is a signal, too
+    known = {
+        q: p.value for q, p in made.plant.parameters.items()
+    }  # a flow of the plant file is a signal, too
     run = {**known, **_signals(made.plant, made.tables[0])}
     sizes, out, at = [], set(), 0
     for k, t in enumerate(law.proposal.terms):
