@@ -26,6 +26,7 @@ SAME = 4.0  # standard errors of a difference of two means below which they are 
 # Least ratio of von Neumann (1941), 2 for white noise: below it, the input moves within its levels. In 120
 # recordings of rigs and generated cases no moving input has more than 1.04.
 WHITE = 1.5
+FARTHEST = 3.0  # standard errors by which a fit moves a level at most
 ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
 
 
@@ -93,11 +94,12 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
         return np.nan_to_num(np.concatenate(rows).ravel())
 
     now = errors(found)
+    misfit = max(float(np.mean(now**2)), 1.0)  # missing physics must not move a level
     for column, v in found.items():
         moved = [replace(v, values=v.values + v.sd * (np.arange(len(v.sd)) == k)) for k in range(len(v.sd))]
         slopes = np.stack([errors({**found, column: m}) - now for m in moved], axis=1)
-        step = np.linalg.solve(slopes.T @ slopes + np.eye(len(v.sd)), -slopes.T @ now)
-        out[column] = replace(v, values=v.values + v.sd * step)
+        step = np.linalg.solve(slopes.T @ slopes + misfit * np.eye(len(v.sd)), -slopes.T @ now)
+        out[column] = replace(v, values=v.values + v.sd * np.clip(step, -FARTHEST, FARTHEST))
     return out
 
 
