@@ -206,14 +206,19 @@ def at_bound(f: Fitted) -> bool:
 
 
 def equation(f: Fitted, law: PlacedLaw, numbers: bool = False) -> str:
-    """Return the flow of a law of a hypothesis with its parameters' short names or numbers."""
+    """Return the flow of a law of a hypothesis with its parameters' short names or numbers.
+
+    With numbers, the text of each memory follows."""
     c, text, values = law.candidate, readable(law_rate(f, law)), f.plant.parameters
+    terms = enumerate(law.proposal.terms, 1)
+    told = "".join(f"; m{k} is {t.memory_text(k)}" for k, t in terms if t.form.memory) if numbers else ""
     for q in c.effect.parameters:
         own = c.own(q.name)
         short = own if q.name in {*f.plant.nodes, *f.plant.inputs} else q.name
         shown = f"{values[own].value:.3g}" if numbers and own in values else short
-        text = re.sub(rf"\b{re.escape(own)}\b", f"({shown})" if shown.startswith("-") else shown, text)
-    return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text)
+        shown = f"({shown})" if shown.startswith("-") else shown
+        text, told = re.sub(rf"\b{re.escape(own)}\b", shown, text), re.sub(rf"\b{q.name}\b", shown, told)
+    return re.sub(rf"\b(m\d)_{re.escape(c.in_plant)}\b", r"\1", text) + told
 
 
 def plain(f: Fitted, law: PlacedLaw) -> str | None:
