@@ -151,6 +151,16 @@ RULES: Mapping[str, Rule] = {
         {"diagnose.between": lambda plant, made: made(plant)},
         searches=True,
     ),
+    "levels": Rule(
+        "an input whose reading scatters about levels drives the plant by them where it fits better so",
+        {"diagnose.steady": lambda case, made, tables, reserve: (case, [*reserve])},
+        searches=True,
+    ),
+    "place of a flow": Rule(
+        "a law may take the place of a flow whose factor is held at its lower bound",
+        {"law.refit._with_room": lambda f, laws: None},
+        searches=True,
+    ),
     "energy": Rule(
         "where the error is twice the noise, effects are proposed by their gain in energy, too",
         {"search.screening.LOUD": float("inf")},
