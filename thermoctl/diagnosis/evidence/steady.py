@@ -83,8 +83,10 @@ def _driven(tables: Sequence[Table], found: Mapping[str, Levels]) -> list[Table]
 
 
 def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) -> dict[str, Levels]:
-    """Return the levels after a step to the outputs' errors at the case's refit. Raises SimulationError."""
-    model, fit, out = case.null.model, case.null, dict(found)
+    """Return the levels after a step, with the plant's unknowns, to the outputs' errors at the case's refit.
+
+    Raises SimulationError."""
+    model, fit = case.null.model, case.null
     sigma = np.array([s.sigma for s in fit.noise])
 
     def errors(changed: Mapping[str, Levels]) -> np.ndarray:
@@ -94,13 +96,26 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
         return np.nan_to_num(np.concatenate(rows).ravel())
 
     now = errors(found)
+    changed = [
+        errors({**found, c: replace(v, values=v.values + v.sd * (np.arange(len(v.sd)) == k))}) - now
+        for c, v in found.items()
+        for k in range(len(v.sd))
+    ]
+    parts = []
+    problem = Problem(model, [model.excitation(t) for t in _driven(tables, found)], fit.noise)
+    for r, d in enumerate(problem.excitations):
+        unknowns, _, own = problem.jacobian(r, fit.values[r], fit.dx0[r])
+        part = np.zeros((*own.shape[:2], len(problem.unknowns)))
+        part[:, :, unknowns] = own * np.isfinite(d.y)[:, :, None] / sigma[:, None]
+        parts.append(-part.reshape(-1, part.shape[2]))
+    slopes = np.hstack([np.stack(changed, axis=1), np.concatenate(parts)])
     misfit = max(float(np.mean(now**2)), 1.0)  # missing physics must not move a level
-    for column, v in found.items():
-        moved = [replace(v, values=v.values + v.sd * (np.arange(len(v.sd)) == k)) for k in range(len(v.sd))]
-        slopes = np.stack([errors({**found, column: m}) - now for m in moved], axis=1)
-        step = np.linalg.solve(slopes.T @ slopes + misfit * np.eye(len(v.sd)), -slopes.T @ now)
-        out[column] = replace(v, values=v.values + v.sd * np.clip(step, -FARTHEST, FARTHEST))
-    return out
+    step = np.linalg.solve(slopes.T @ slopes + misfit * np.eye(slopes.shape[1]), -slopes.T @ now)
+    steps = np.split(step, np.cumsum([len(v.sd) for v in found.values()]))
+    return {
+        c: replace(v, values=v.values + v.sd * np.clip(own, -FARTHEST, FARTHEST))
+        for (c, v), own in zip(found.items(), steps, strict=False)
+    }
 
 
 def levels(columns: Sequence[np.ndarray]) -> Levels | None:
