@@ -238,13 +238,8 @@ def _laws(s: Search, parent: Weighed, goal: Goal) -> list[Weighed]:
 
     def refitted(base: Weighed) -> list[tuple[Proposal, Weighed]]:
         """Return the laws that were refitted beside a hypothesis; single ones beside a part of the parent."""
-        more, plant = parent.score - base.score, base.fitted.plant
-        known = {*plant.nodes, *plant.inputs, *plant.parameters, *case.columns[0], "t"}
-        some = [
-            replace(p, promise=p.promise + more)
-            for p in proposals
-            if base is parent or len(p.terms) == 1 and known >= {*p.place.nodes, *p.reads}
-        ]
+        more, single = parent.score - base.score, base is not parent
+        some = [replace(p, promise=p.promise + more) for p in proposals if len(p.terms) == 1 or not single]
         least = replace(goal, least=tuple(x + more for x in goal.least))
         tried = refits(case, base.fitted, some, least)
         return [(p, Weighed(f, base.log_odds - p.cost)) for p, f in tried]

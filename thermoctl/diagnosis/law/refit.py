@@ -53,9 +53,12 @@ def refitted_law(
 ) -> Fitted | None:
     """Refit the parent with a law from its proposed sizes; None where the plant cannot be simulated.
 
-    The refit ends early if it stays far from `leader`, the likeliest one so far. `more`: laws at other places
-    that are added, too."""
+    So is a law that reads what an effect adds and the parent lacks. The refit ends early if it stays far from
+    `leader`, the likeliest one so far. `more`: laws at other places that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
+    known = {*plant.nodes, *plant.inputs, *plant.parameters, *plant.outputs, *case.columns[0], "t"}
+    if not known.issuperset(n for q in (p, *more) for n in (*q.place.nodes, *q.reads)):
+        return None
     drives: Sequence[Excitation] = case.drives(parent.rough.model)
     try:
         for q in (p, *more):
