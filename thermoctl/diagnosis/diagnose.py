@@ -140,7 +140,7 @@ def decided(sought: Sought) -> Diagnosis:
     chosen, posterior, asked = _chosen(sought, tried, physics)
     null = best = with_residuals(known, closest(known, tried[frozenset()].fitted))
     if chosen:
-        best = with_residuals(known, tried[chosen].fitted)
+        best = with_residuals(known, closest(known, tried[chosen].fitted))
         best = replace(best, sd=deviations(best, energy, numbers))
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
