@@ -15,6 +15,7 @@ from thermoctl.plant.simulation.simulate import Excitation
 from thermoctl.recording.table import Table
 
 LEAST = 40  # least number of readings of an output in a recording: of fewer none is left out
+RIGHT, SOON = 2, 10  # number of rows right after a switch; in which an answer of two rows may begin
 CHANCE = 0.05  # chance of so many outliers right after switches, below which the plant answers there
 TOLD = 6  # largest number of outliers' times that a note lists for a column
 
@@ -31,14 +32,13 @@ def without_outliers(
 ) -> tuple[list[Table], Outliers]:
     """Return the recordings without cells whose residual is far from its neighbours', and these cells.
 
-    Where inputs switch, an error of several rows may be an answer to that. So may one at the end be, and one
-    of a single row if more of these come right after switches than by chance.
+    Soon after an input switches, an error of two rows may be an answer to that. So may one at the end be, and
+    one of a single row if more of these come right after switches than by chance.
     `as_stated`: residuals with the stated initial states. First readings that these predict are no outliers:
     their large residual is due to an initial state that the refit moved."""
     out, dropped = [], []
     for t, d, e, stated in zip(tables, drives, residuals, as_stated, strict=True):
-        columns, after = dict(t.columns), _after_switches(d)
-        switched = bool(after.any())
+        columns, after, soon = dict(t.columns), _after_switches(d, RIGHT), _after_switches(d, SOON)
         for j, o in enumerate(plant.outputs.values()):
             index = np.flatnonzero(np.isfinite(e[:, j]))
             if len(index) < LEAST:
@@ -48,7 +48,7 @@ def without_outliers(
             predicted = np.logical_and.accumulate(np.abs(stated[index, j]) <= limit)
             far = (np.abs(away) > limit) & (_from_neighbours(e[index, j]) > limit) & ~predicted
             lasts = ~_lonely(e[index, j])
-            lasts[:-1] &= switched  # nothing but a switch is answered so quickly
+            lasts[:-1] &= soon[index[:-1]]  # nothing but a switch is answered so quickly
             odd = _without_answers(index[far & ~lasts], after)
             if len(odd) and far.sum() < 0.02 * len(index):
                 columns[o.column] = columns[o.column].copy()
@@ -58,13 +58,12 @@ def without_outliers(
     return out, tuple(dropped)
 
 
-def _after_switches(d: Excitation) -> np.ndarray:
-    """Return which rows (N,) are the first two in which an input that switched may act."""
-    after = np.zeros(len(d.t), bool)
+def _after_switches(d: Excitation, rows: int) -> np.ndarray:
+    """Return which rows (N,) are the first ones in which an input that switched may act."""
+    after = np.zeros(len(d.t) + rows, bool)
     for u in d.u.T:
-        rows = np.flatnonzero(switches(u)) + 1
-        after[np.concatenate([rows, np.minimum(rows + 1, len(after) - 1)])] = True
-    return after
+        after[np.add.outer(np.flatnonzero(switches(u)) + 1, np.arange(rows))] = True
+    return after[: len(d.t)]
 
 
 def _without_answers(odd: np.ndarray, after: np.ndarray) -> np.ndarray:
