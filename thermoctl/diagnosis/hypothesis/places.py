@@ -334,10 +334,10 @@ def _fixed_nodes(rig: Rig) -> Iterator[Place]:
 
 
 def _fixed_flows(rig: Rig) -> Iterator[Place]:
-    """Yield flows that depend on their own node, and that have no free parameter."""
+    """Yield flows that depend on their own node or on a parameter, and that have no free parameter."""
     for f in rig.physics.flows.values():
-        ends = {e for e in (f.source, f.target) if e}
-        if ends & ex.names(f.rate) & set(storing(rig)) and not _free(rig, f.rate):
+        known = {f.source, f.target} & {*storing(rig)} | rig.physics.parameters.keys()
+        if known & ex.names(f.rate) and not _free(rig, f.rate):
             yield Place(f.name, {}, flow=f.name)
 
 
