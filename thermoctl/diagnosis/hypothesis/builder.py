@@ -131,7 +131,7 @@ class _Builder:
             self.symbols[p.name] = name(c.own(p.name))
         for e in (*c.symbols.values(), *c.place.symbols.values()):
             for column in ex.names(e) & {*self.rig.spare}:
-                self.inputs.setdefault(column, Input(column, None, column, False))
+                self.inputs.setdefault(column, Input(column, None, column, self.rig.is_smooth(column)))
 
     def _of_electronics(self) -> bool:
         """Is the effect an error of a reading without a state of its own?"""
@@ -317,6 +317,9 @@ class _Builder:
             if ex.names(slope) <= set(values):
                 total += (float(ex.evaluate(slope, values)) * (self.base.nodes[n].initial_sigma or 0.0)) ** 2
         return float(np.sqrt(total)) or None
+
+    def _recorded(self, symbol: str) -> None:
+        """Change nothing: the symbol is a recorded input, which is known ahead (`candidates`)."""
 
     def _straight(self, symbol: str) -> None:
         """Interpolate held inputs linearly in this symbol.

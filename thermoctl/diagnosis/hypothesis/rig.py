@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermoctl.diagnosis.data.rows import OUTLIER
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
 from thermoctl.units import dimension
@@ -179,6 +180,16 @@ class Rig:
             if all(np.isfinite(t[c]).any() and np.ptp(t[c][np.isfinite(t[c])]) > 0 for t in self.columns)
         ]
         return [c for c in moving if not all(map(_is_clock, self.drives, (t[c] for t in self.columns)))]
+
+    def is_smooth(self, column: str) -> bool:
+        """Return whether a column is on straight lines: its changes follow each other, and are no jumps."""
+        for part in (t[column][np.isfinite(t[column])] for t in self.columns):
+            step = np.abs(np.diff(part))
+            changed = step > 0
+            again = np.mean(changed[1:][changed[:-1]]) if changed[:-1].any() else 0.0
+            if again <= 0.5 or step.max() > OUTLIER * 1.4826 * np.median(step[changed]):
+                return False
+        return True
 
     def kind(self, q: Input | Node | Output) -> str:
         """Return the kind of a quantity: from its role, its motion, the node that it reads, or its unit."""
