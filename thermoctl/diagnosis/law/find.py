@@ -149,11 +149,12 @@ def refits(
 ) -> list[tuple[Proposal, Fitted]]:
     """Refit the proposals that may beat the best law so far, and return the refits that end at no bound.
 
-    From the best sum, and from one with an insignificant term, the least significant term is left out. A term
+    From the best sum, and from one with an insignificant term, the least significant term is left out. A law
+    of these terms that is less likely may have ended in a wrong optimum: it is refitted from there. A term
     whose shape is at its upper bound gets the form that it becomes there.
     All promises are multiplied by the largest ratio so far of a refit's gain to its promise. Beside a best
     hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
-    tried = list[tuple[Proposal, Fitted]]()
+    tried, scores = list[tuple[Proposal, Fitted]](), dict[object, float]()
     queue, more = list(proposals), SIMPLER
     ratios = list[float]()
     leader, left, ahead = parent, affordable(case, parent), max(goal.least[0], 0.0)
@@ -180,11 +181,13 @@ def refits(
             leader = max(leader, f, key=lambda x: x.log_likelihood)
             if not at_bound(f):
                 tried.append((p, f))
-            best = more_evidence - p.cost >= ahead
-            ahead = max(ahead, more_evidence - p.cost)
+            score = more_evidence - p.cost
+            scores[p.kind] = max(score, scores.get(p.kind, score))
+            best = score >= ahead
+            ahead = max(ahead, score)
             if more and (at_bound(f) or len(p.terms) > 1 and (f.doubtful or best)):
                 simpler = (simpler_law if len(p.terms) > 1 else limit_of)(laws_of(f)[0], f)
-                if simpler.kind not in {q.kind for q in queue}:
+                if scores.get(simpler.kind, -np.inf) < score:
                     queue.append(simpler)
                     more -= 1
     return tried

@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,9 @@ KEPT = 20  # number of values of the shapes of a form over a signal that are kep
 
 @dataclass(frozen=True)
 class Proposal:
-    """Terms at a place, their sizes, and the gain in log likelihood that the linearised plant predicts."""
+    """Terms at a place, their sizes, and the gain in log likelihood that the linearised plant predicts.
+
+    `start`: of a law that was refitted, the values of the plant's parameters there."""
 
     place: Place
     terms: tuple[Term, ...]
@@ -77,6 +79,7 @@ class Proposal:
     promise: float
     look: float  # log of the number of places, signals and forms that a term was chosen from
     limits: Thresholds
+    start: Mapping[str, float] = field(default_factory=dict, compare=False)
 
     @property
     def cost(self) -> float:

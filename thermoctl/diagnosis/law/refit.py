@@ -56,6 +56,8 @@ def refitted_law(
     So is a law that reads what an effect adds and the parent lacks. The refit ends early if it stays far from
     `leader`, the likeliest one so far. `more`: laws at other places that are added, too."""
     plant, effects = parent.rough_plant, parent.hypothesis.effects
+    there = {q: dataclasses.replace(v, value=p.start.get(q, v.value)) for q, v in plant.parameters.items()}
+    plant = dataclasses.replace(plant, parameters=there)
     known = {*plant.nodes, *plant.inputs, *plant.parameters, *plant.outputs, *case.columns[0], "t"}
     if not known.issuperset(n for q in (p, *more) for n in (*q.place.nodes, *q.reads)):
         return None
@@ -129,13 +131,14 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
 
 
 def settled(law: PlacedLaw, f: Fitted) -> Proposal:
-    """Return a refitted law at the values of the refit."""
+    """Return a refitted law at the values of the refit, those of the plant's own parameters, too."""
     p, terms, sizes = law.proposal, list[Term](), list[float]()
     for k, t in enumerate(p.terms, 1):
         values = {q: f.plant.parameters[law.own[f"{q}{k}"]].value for q in (*t.form.sizes, *t.form.shapes)}
         terms.append(dataclasses.replace(t, shapes={q: values[q] for q in t.form.shapes}))
         sizes += [values[q] for q in t.form.sizes]
-    return dataclasses.replace(p, terms=tuple(terms), sizes=tuple(sizes))
+    values = {q: v.value for q, v in f.plant.parameters.items()}
+    return dataclasses.replace(p, terms=tuple(terms), sizes=tuple(sizes), start=values)
 
 
 def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
