@@ -210,6 +210,22 @@ def fitted(
     return result
 
 
+def placed_at(case: Case, f: Fitted, parameters: Mapping[str, float]) -> Fitted:
+    """Return a hypothesis as it stands at other values of its parameters. Raises SimulationError.
+
+    Extensions start there; its likelihood is still that of its refit."""
+    known = {
+        q: dataclasses.replace(p, value=parameters.get(q, p.value)) for q, p in f.plant.parameters.items()
+    }
+    plant = dataclasses.replace(f.plant, parameters=known)
+    posterior = Posterior(case, plant, f.hypothesis.effects)
+    rough = refit.fit(
+        posterior.model, posterior.drives, case.noise, iterations=0, priors=posterior.problem.priors
+    )
+    powers = case.coordinates.powers(posterior.rows(rough.residuals))
+    return dataclasses.replace(f, rough_plant=plant, rough=rough, rough_powers=tuple(powers))
+
+
 def _refitted(
     case: Case,
     plant: Plant,

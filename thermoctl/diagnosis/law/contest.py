@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import softmax
 
 from thermoctl.diagnosis.data.case import FAILS, Case
-from thermoctl.diagnosis.evidence.fit import Fitted, Placed
+from thermoctl.diagnosis.evidence.fit import Fitted, Placed, placed_at
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.hypothesis.candidates import Keys
@@ -58,6 +58,7 @@ def with_laws(s: Search) -> Search:
         case.budget.progress("looking for laws at two places")
         done = case.budget.fits_done
         _compete(s, _pairs(s), done)
+    _as_known(s)
     lead, weighed = s.best, {*s.tried}
     _make_rarer(s, weighed)  # another hypothesis may lead now, with effects that its law makes needless
     if s.best.fitted is not lead.fitted:
@@ -123,6 +124,24 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
         grow(s)
         swap(s)
         _fewer(s)
+
+
+def _as_known(s: Search) -> None:
+    """Extend what stands beside the leading law by effects, from the law's refit.
+
+    There an effect may be found that is the law, and whose own refit ended in a wrong optimum."""
+    best = s.best.fitted
+    if not laws_of(best) or s.case.budget.stopped():
+        return
+    base = _beside(s, [e for e in best.hypothesis.effects if not isinstance(e, PlacedLaw)], best)
+    if base:
+        values = {q: p.value for q, p in best.plant.parameters.items()}
+        try:
+            s.extended(replace(base, fitted=placed_at(s.case, base.fitted, values)), True)
+        except FAILS:
+            return
+        if s.best.fitted is not best:
+            swap(s)
 
 
 def _fewer(s: Search) -> None:

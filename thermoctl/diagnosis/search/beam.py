@@ -11,16 +11,19 @@ import numpy as np
 from thermoctl.diagnosis.data.case import FAILS, Budget, Case
 from thermoctl.diagnosis.data.memory import NOTHING, PlacedBefore
 from thermoctl.diagnosis.evidence.fit import (
+    HOPELESS,
     WHITE,
     Fitted,
     Placed,
     as_refitted,
     fitted,
     near_nothing,
+    placed_at,
     placed_before,
 )
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.odds import odds
+from thermoctl.diagnosis.evidence.posterior import BELIEF
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, found_again
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.search.again import Known
@@ -33,6 +36,7 @@ from thermoctl.diagnosis.search.screening import Screened, places, screened
 from thermoctl.diagnosis.search.shortlist import HALF, Extension, elsewhere, shortlist, simpler
 from thermoctl.plant.fitting import refit
 from thermoctl.plant.fitting.cores import batches
+from thermoctl.plant.fitting.residuals import Scale
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Excitation, compile_plant
 
@@ -118,9 +122,11 @@ class Search:
                     odds = min(w.log_odds, simpler.score - w.fitted.log_evidence)
                     self.tried[keys] = Weighed(w.fitted, odds)
 
-    def extended(self, parent: Weighed) -> list[Weighed]:
-        """Extend a hypothesis, once; by nothing where its plant has no responses."""
-        if parent.fitted.hypothesis.keys in self.seen:
+    def extended(self, parent: Weighed, again: bool = False) -> list[Weighed]:
+        """Extend a hypothesis, once; by nothing where its plant has no responses.
+
+        `again`: from other values of its parameters, with effects whose refit may have ended elsewhere."""
+        if parent.fitted.hypothesis.keys in self.seen and not again:
             return []
         if self.case.budget.spent:
             self.case.budget.untried += 1
@@ -135,7 +141,7 @@ class Search:
             self.norms = looked.norms
         for d, gain in looked.promised:
             self.promised[d.candidate.key] = max(gain, self.promised.get(d.candidate.key, 0.0))
-        found = extensions(self, parent, looked)
+        found = extensions(self, parent, looked, again)
         self.keep(found)
         return found
 
@@ -164,6 +170,7 @@ def search(case: Case) -> Search:
     if with_observer(s):
         grow(s)
         swap(s)
+    afresh(s)
     s.admit()
     return s
 
@@ -235,6 +242,32 @@ def swap(s: Search) -> None:
             s.extended(parent)
         if s.best is best:
             return
+
+
+def afresh(s: Search) -> None:
+    """Extend parts of the best hypothesis that are far from the plant file's values from these.
+
+    Without an effect a refit may move a parameter to where the effect changes nothing, and hides it: the lag
+    of a member whose expansion is nearly none. Where the best hypothesis is near these values, it is right
+    against a part that is far less likely."""
+    best, own = s.best, s.case.plant.parameters
+    scales = {q: Scale(p) for q, p in own.items() if p.range}
+
+    def far(f: Fitted) -> bool:
+        """Return whether a parameter is farther from its value in the file than its prior spreads."""
+        there = f.rough_plant.parameters
+        return any(abs(x.z(there[q].value) - x.z(own[q].value)) > BELIEF for q, x in scales.items())
+
+    parts = [w for keys, w in s.tried.items() if keys < best.fitted.hypothesis.keys or w is best and not keys]
+    least = -np.inf if far(best.fitted) else best.score - HOPELESS
+    for w in (w for w in parts if w.score > least and far(w.fitted)):
+        try:
+            there = placed_at(s.case, w.fitted, {q: p.value for q, p in own.items()})
+        except FAILS:
+            continue
+        s.extended(dataclasses.replace(w, fitted=there), True)
+    if s.best is not best:
+        swap(s)
 
 
 def simplified(s: Search) -> list[Weighed]:
@@ -411,7 +444,7 @@ def leaders(tried: Sequence[Weighed], most: int) -> list[Weighed]:
     return list(out.values())[:most]
 
 
-def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
+def extensions(s: Search, parent: Weighed, looked: Screened, again: bool = False) -> list[Weighed]:
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
     An extension is left out if twice its predicted gain does not bring it to the leader. Every prediction is
@@ -421,6 +454,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted)
     queue, ratio = shortlist(looked, s.price, limits.shortlist, paired=misfit), 1.0
+    known = set[Keys]() if again else tried.keys() | s.refused.keys()
     new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
     queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
@@ -428,14 +462,14 @@ def extensions(s: Search, parent: Weighed, looked: Screened) -> list[Weighed]:
         """Return whether an extension is new and may win, and a refit is left."""
         added, gain = item
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
-        if keys in tried or keys in s.refused or len(keys) > limits.effects:
+        if keys in known or len(keys) > limits.effects:
             return False
         if parent.score + HALF * ratio * gain < max(w.score for w in [*tried.values(), *out]):
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
             return False
-        s.refuse(keys, None)  # until it is refitted: a second one is not new
+        known.add(keys)
         return True
 
     for batch, left in batches(queue, wanted):
