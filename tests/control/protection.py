@@ -7,6 +7,7 @@ so that sums of them are exact and a limit can be met exactly: at the limit noth
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -1330,7 +1331,7 @@ def the_state_machine(module):
     OFF, SAFE, READY, ARMED, FAULT = range(5)
     for state in range(5):
         for command in range(4):
-            for tripped, critical in ((False, False), (True, False), (True, True)):
+            for tripped, critical in itertools.product((False, True), repeat=2):
                 assert next_state(state, command, False, tripped, critical) == OFF
                 if state == OFF:
                     expected = SAFE
