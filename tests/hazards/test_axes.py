@@ -70,36 +70,12 @@ def test_a_fault_of_one_axis_disarms_the_other_within_a_tick(tmp_path, axis, oth
     assert not axes.faults(axis) and not axes.faults(other)
 
 
-@pytest.mark.parametrize("first, second", ["xy", "yx"])
-def test_both_axes_are_acknowledged_in_any_order(tmp_path, first, second):
-    axes = armed(tmp_path)
-    for axis in "xy":
-        break_position(axes, axis)
-    axes.tick(200)
-    assert [axes.state(a) for a in "xy"] == ["FAULT", "FAULT"]
-    for axis in "xy":
-        del axes.by_name[axis].backend.rig.measured
-    axes.tick(50)
-    axes.send(first, "disarm")
-    axes.send(second, "disarm")
-    axes.ready()
-
-
 def test_an_axis_that_goes_on_is_not_touched(tmp_path):
     axes = armed(tmp_path, GO_ON)
     break_position(axes, "x")
     axes.tick(200)
     assert axes.state("x") == "FAULT" and axes.state("y") == "ARMED"
     assert enabled(axes, "x") == 0.0 and enabled(axes, "y") == 1.0 and not axes.faults("y")
-
-
-def test_an_axis_that_was_never_armed_stops_no_other(tmp_path):
-    axes = Axes(load_rig(simulated_axes(tmp_path)))
-    break_position(axes, "x")
-    axes.tick(1000)
-    axes.send("y", "arm")
-    axes.tick(50)
-    assert axes.state("x") != "FAULT" and axes.state("y") == "ARMED"
 
 
 @pytest.fixture
