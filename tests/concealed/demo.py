@@ -96,7 +96,7 @@ def conceal(
         columns = [("t", recording["t"]), *((c, recording[key]) for c, key in scene.columns.items())]
         columns += [
             (c, sensors.record(true[k][:, j], bench.noise[j], scene.sd[j], scene.resolution[j], {}, rng))
-            for j, c in enumerate(scene.output_columns)
+            for j, c in enumerate(scene.outputs)
         ]
         tables.append(columns)
     plant = scene.plant

@@ -364,7 +364,7 @@ def make_case(
     for k, run in enumerate(scene.runs):
         columns = [("t", jittered(run["t"], opened.clock_jitter if opened else 0.0, rng))]
         columns += [(c, run[key]) for c, key in scene.columns.items()]
-        for j, c in enumerate(scene.output_columns):
+        for j, c in enumerate(scene.outputs):
             dirt = (
                 {"outliers": 0.0015}
                 if dirt_kind == "outliers"

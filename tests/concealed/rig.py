@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -34,13 +34,22 @@ class Scene:
     runs: list[dict]  # t, inputs and everything the truth wants
     columns: dict[str, str]  # recorded input column -> key in run
     outputs: list[str]
-    output_columns: list[str]
     sd: np.ndarray
     resolution: np.ndarray
     outputs_of: Callable[[int, list[Variant]], np.ndarray]  # (run, rows) -> (m, N, ny) readings without noise
     suspects: list[Suspect] = field(default_factory=list)
     unknowns: list[Suspect] = field(default_factory=list)
     rough_of: Callable[[int, list[Variant]], np.ndarray] | None = None  # outputs_of with fewer volumes
+
+    @classmethod
+    def of(cls, plant: dict, theta: dict, runs: list[dict], columns: dict[str, str], *truth: Any) -> Scene:
+        """A scene whose ranges, starts and sensors are those of its plant file. `truth`: outputs_of and what follows it."""
+        outputs = plant["outputs"]
+        ranges = {q: tuple(p["range"]) for q, p in plant["parameters"].items() if "range" in p}
+        starts = {n: x["initial_sigma"] for n, x in plant["nodes"].items() if "initial_sigma" in x}
+        sd = np.array([o["noise"] for o in outputs.values()])
+        resolution = np.array([o.get("resolution", 0.0) for o in outputs.values()])
+        return cls(plant, theta, ranges, starts, runs, columns, list(outputs), sd, resolution, *truth)
 
     def changes_of(self, k: int, rows: list[Variant], rough: bool) -> np.ndarray:
         """Changes (m - 1, N, ny) of the readings from those of the first of `rows`; rough: of fewer volumes, where that saves time."""

@@ -266,7 +266,7 @@ class FreeStage:
         }
         if damped:
             belief["damping"] = (200.0 * size, "N*s/m", 20 * size, 800 * size)
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         n, period = (4000 if short else 8000), 0.0025
         runs = []
         for _ in range(2):
@@ -347,21 +347,7 @@ class FreeStage:
             ),
             Suspect("?one_way_gain", "motor", lambda s: {"A": 0.12 * s}, top=4, aliases=("velocity",)),
         ]
-        return Scene(
-            plant,
-            theta,
-            ranges,
-            {"position": 0.001},
-            runs,
-            {"drive": "drive"},
-            ["encoder"],
-            ["encoder"],
-            np.array([noise]),
-            np.array([0.01 if fine else 0.0]),
-            outputs_of,
-            suspects,
-            unknowns,
-        )
+        return Scene.of(plant, theta, runs, {"drive": "drive"}, outputs_of, suspects, unknowns)
 
 
 class Flexure:
@@ -388,7 +374,7 @@ class Flexure:
             belief["K_e"] = (9.0, "V*s/m", 4, 18)
         if knows["inductance"]:
             belief["L"] = (4e-3, "H", 1e-3, 1.2e-2)
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         theta["knows_copper"] = float(knows["copper_resistance"])
         n, period = (4000 if short else 9000), 0.005
         runs = []
@@ -441,7 +427,6 @@ class Flexure:
             volts += " + L * current_rate"
         inputs["air"] = {"unit": "degC", "column": "air_temperature", "between_samples": "linear"}
         outputs = ["position_read", "voltage", "coil_temperature"]
-        sd = np.array([0.002, 0.01, 0.15])
         plant = {
             "format": "thermoctl-plant/1",
             "title": "Voice-coil stage on flexures",
@@ -516,19 +501,5 @@ class Flexure:
             Suspect("?sticky_zone", "velocity", lambda s: {"F": 0.1 * force * s, "X": 0.002}, top=6),
             Suspect("?one_way_gain", "motor", lambda s: {"A": 0.05 * s}, top=4, aliases=("velocity",)),
         ]
-        columns_ = {"current": "drive", "current_rate": "current_rate", "air_temperature": "air"}
-        return Scene(
-            plant,
-            theta,
-            ranges,
-            {"position": 1e-5, "coil": 0.2},
-            runs,
-            columns_,
-            outputs,
-            outputs,
-            sd,
-            np.zeros(3),
-            outputs_of,
-            suspects,
-            unknowns,
-        )
+        columns = {"current": "drive", "current_rate": "current_rate", "air_temperature": "air"}
+        return Scene.of(plant, theta, runs, columns, outputs_of, suspects, unknowns)

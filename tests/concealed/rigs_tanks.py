@@ -22,11 +22,10 @@ class Tanks:
         names = ["upper", "lower"] if rng.random() < 0.6 else ["upper", "middle", "lower"]
         belief: dict[str, tuple] = {"k_pump": (0.05, "1/s", 0.01, 0.2)}
         belief |= {f"k_{n}": (0.06, "V**0.5/s", 0.015, 0.25) for n in names}
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         seen = names[1:] if rng.random() < 0.6 else names
         if seen != names:  # without the upper level only k_pump fixes its scale
             belief["k_pump"] = (theta["k_pump"], "1/s")
-            ranges.pop("k_pump")
         n, period = (800 if short else 1600), 3.0
         top = 5.5 * theta["k_upper"] / theta["k_pump"] * 0.5
         runs = []
@@ -97,21 +96,8 @@ class Tanks:
             Suspect("?clogging", f"{x}_outflow", lambda s: {"A": 0.12 * s}, top=4, aliases=(x,))
             for x in names
         ]
-        scene = Scene(
-            plant,
-            theta,
-            ranges,
-            {x: 0.03 for x in names},
-            runs,
-            {"pump": "pump"} | {f"{x}_start": f"{x}_start" for x in names},
-            [f"level_{x}" for x in seen],
-            [f"level_{x}" for x in seen],
-            np.full(len(seen), 0.02),
-            np.full(len(seen), 0.005),
-            outputs_of,
-            suspects,
-            unknowns,
-        )
+        columns = {"pump": "pump"} | {f"{x}_start": f"{x}_start" for x in names}
+        scene = Scene.of(plant, theta, runs, columns, outputs_of, suspects, unknowns)
         for run in runs:
             run["off"] = rng.normal(0, 0.015, len(names))
         return scene

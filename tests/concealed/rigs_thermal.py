@@ -15,10 +15,9 @@ from tests.concealed.thermal import Network, Variant, simulate
 HALF, TWO = (0.5, 2.0), (0.4, 2.5)
 
 
-def _draw(belief: dict[str, tuple], rng: np.random.Generator) -> tuple[dict, dict]:
-    """The truth's parameter values and the refit's ranges, from {name: (value, unit, low, high)} or (value, unit)."""
-    theta = {n: (off_centre(b[0], b[2], b[3], rng) if len(b) == 4 else b[0]) for n, b in belief.items()}
-    return theta, {n: (b[2], b[3]) for n, b in belief.items() if len(b) == 4}
+def _draw(belief: dict[str, tuple], rng: np.random.Generator) -> dict[str, float]:
+    """The truth's parameter values, from {name: (value, unit, low, high)} or (value, unit)."""
+    return {n: (off_centre(b[0], b[2], b[3], rng) if len(b) == 4 else b[0]) for n, b in belief.items()}
 
 
 def _parameter_block(belief: dict[str, tuple]) -> dict:
@@ -213,7 +212,7 @@ class Actuator:
             "a_stator": (-0.2, "um/K", -0.8, 0.0),
             "T_ref": (22.0, "degC"),
         }
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         edges = {f"{a}_to_{b}": (f"G_{a}_{b}", a, b) for a, b in _LINKS}
         edges |= {f"{n}_to_air": (f"H_{n}", n, "air") for n in _FILMS}
         net = Network({n: f"C_{n}" for n in _NODES}, edges, {"joule": ("coil", "vi")})
@@ -368,28 +367,9 @@ class Actuator:
             ["bobbin", "outer_stator"], ["outer_stator_to_air", "bracket_1_to_air"], net, rng
         )
         unknowns.append(Suspect("?output_memory", "position_error", lambda s: {"A": 0.1 * s}))
-        return Scene(
-            plant,
-            theta,
-            ranges,
-            {b: 0.2 for b in _NODES},
-            runs,
-            {
-                "current": "current",
-                "voltage": "voltage",
-                "position": "position",
-                "velocity": "velocity",
-                "air_temperature": "air",
-            },
-            outputs,
-            outputs,
-            np.array([0.06] * len(seen) + [0.05]),
-            np.zeros(len(outputs)),
-            outputs_of,
-            suspects,
-            unknowns,
-            partial(outputs_of, net=replace(net, cells=FEW)),
-        )
+        columns = {n: n for n in ("current", "voltage", "position", "velocity")} | {"air_temperature": "air"}
+        rough_of = partial(outputs_of, net=replace(net, cells=FEW))
+        return Scene.of(plant, theta, runs, columns, outputs_of, suspects, unknowns, rough_of)
 
 
 # --- two heated blocks --------------------------------------------------------------------------------
@@ -415,7 +395,7 @@ class Heater:
         if three:
             belief["G_23"] = (0.03, "W/K", 0.006, 0.1)
             edges["between_23"] = ("G_23", "block_2", "block_3")
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         heated = [1, 2]
         net = Network(
             {f"block_{i}": f"C_{i}" for i in ids},
@@ -489,21 +469,8 @@ class Heater:
                 f"temperature_{i}", 1.0, span, 20.0, True, rng, top_value=(peaks[i - 1] if i < 3 else None)
             )
         unknowns = thermal_unknowns(blocks[:2], ["loss_1", "loss_2"], net, rng)
-        return Scene(
-            plant,
-            theta,
-            ranges,
-            {b: 0.5 for b in blocks},
-            runs,
-            {f"heat_{i}": f"heat_{i}" for i in heated} | {"air_temperature": "air"},
-            outputs,
-            outputs,
-            np.full(count, noise),
-            np.full(count, 0.1 if coarse else 0.0),
-            outputs_of,
-            suspects,
-            unknowns,
-        )
+        columns = {f"heat_{i}": f"heat_{i}" for i in heated} | {"air_temperature": "air"}
+        return Scene.of(plant, theta, runs, columns, outputs_of, suspects, unknowns)
 
 
 # --- an electric drive --------------------------------------------------------------------------------
@@ -527,7 +494,7 @@ class Drive:
         }
         if knows["back_emf"]:
             belief["K_e"] = (0.11, "V*s/rad", 0.05, 0.25)
-        theta, ranges = _draw(belief, rng)
+        theta = _draw(belief, rng)
         edges = {
             "winding_to_housing": ("G_winding", "winding", "housing"),
             "housing_to_flange": ("G_flange", "housing", "flange"),
@@ -672,20 +639,5 @@ class Drive:
             ]
         unknowns = thermal_unknowns(["housing"], ["housing_to_air"], net, rng)
         unknowns.append(Suspect("?output_memory", "winding_voltage", lambda s: {"A": 0.05 * s}))
-        sd = np.array([spec[o]["noise"] for o in outputs])
         columns = {"current": "current", "speed": "speed", "air_temperature": "air"}
-        return Scene(
-            plant,
-            theta,
-            ranges,
-            {b: 0.3 for b in net.bodies},
-            runs,
-            columns,
-            outputs,
-            outputs,
-            sd,
-            np.zeros(len(outputs)),
-            outputs_of,
-            suspects,
-            unknowns,
-        )
+        return Scene.of(plant, theta, runs, columns, outputs_of, suspects, unknowns)

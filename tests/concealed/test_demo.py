@@ -26,7 +26,7 @@ def test_a_plant_with_the_true_values_compensates_the_true_growth(tmp_path):
             *((c, run[k]) for c, k in scene.columns.items()),
             *(
                 (c, sensors.record(true[:, j], sensors.Noise(scene.sd[j]), scene.sd[j], 0.0, {}, rng))
-                for j, c in enumerate(scene.output_columns)
+                for j, c in enumerate(scene.outputs)
             ),
         ],
     )
