@@ -177,6 +177,18 @@ outputs:
   T: {value: one, unit: degC, noise: 0.05}
 """
 
+HEATED_BLOCK = """format: thermoctl-plant/1
+title: Heated block
+inputs: {heat: {unit: W}, air: {unit: degC}}
+parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
+nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
+flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
+outputs: {T_block: {value: T, unit: degC, noise: 0.05}}
+"""
+HEATED_RADIATES = HEATED_BLOCK.replace(
+    "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
+)
+
 RADIATED = "{from: block, rate: 3e-9 * ((block + 273.15)**4 - (air + 273.15)**4), unit: W}"
 
 

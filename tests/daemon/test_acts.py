@@ -12,6 +12,7 @@ import pytest
 
 from tests.acts import ACTS
 from tests.daemon.process import ROOT, Daemon, patient, wait
+from tests.plants import HEATED_BLOCK, HEATED_RADIATES
 from tests.simulated import rig_file
 from thermoctl import cli
 from thermoctl.configuration.which_rig import ACTING
@@ -45,16 +46,11 @@ BESIDE = {  # command: (arguments, exit status) by which a person who means some
 }  # fmt: skip
 MOVES_IT = {"tune", "experiment", "calibrate", "diagnose"}
 """Commands that drive the daemon's rig: without a `go` status 2 where it is READY; else 3, also with --yes."""
-PLANT = """\
-format: thermoctl-plant/1
-inputs: {heat: {unit: W, column: power_w}, air: {unit: degC}}
-parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
-nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
-flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
-outputs: {T_body: {value: T, column: bobbin_c, unit: degC, noise: 0.05}}
-"""
-RADIATES = PLANT.replace(
-    "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
+PLANT, RADIATES = (
+    plant.replace("heat: {unit: W}", "heat: {unit: W, column: power_w}").replace(
+        "T_block: {value: T,", "T_body: {value: T, column: bobbin_c,"
+    )
+    for plant in (HEATED_BLOCK, HEATED_RADIATES)
 )
 
 

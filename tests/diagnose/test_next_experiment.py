@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.plants import HEATED_BLOCK, HEATED_RADIATES
 from thermoctl.cli import main
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.experiment import file as experiment_file
@@ -27,22 +28,7 @@ from thermoctl.recording.files import read_table, write_table
 from thermoctl.recording.table import Table
 
 CONFIG = Path(__file__).resolve().parents[2] / "config/simulated.yaml"
-BELIEF = """format: thermoctl-plant/1
-title: Heated block
-inputs: {heat: {unit: W}, air: {unit: degC}}
-parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
-nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
-flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
-outputs: {T_block: {value: T, unit: degC, noise: 0.05}}
-"""
-TRUTH = (
-    BELIEF.replace(
-        "flows: {",
-        "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, ",
-    )
-    .replace("value: 40,", "value: 46,")
-    .replace("value: 0.25,", "value: 0.2,")
-)
+TRUTH = HEATED_RADIATES.replace("value: 40,", "value: 46,").replace("value: 0.25,", "value: 0.2,")
 LIMITS = {"T_block": (15.0, 110.0)}
 
 
@@ -55,7 +41,7 @@ def short_pulses():
 
 @pytest.fixture(scope="module")
 def undecided():
-    return shared_by_two(BELIEF, TRUTH, short_pulses())
+    return shared_by_two(HEATED_BLOCK, TRUTH, short_pulses())
 
 
 def shared_by_two(belief, truth, inputs):
@@ -100,7 +86,7 @@ def test_proposal_stays_inside_the_limits_and_is_the_best_per_hour(undecided):
     assert near["bits"] < 0.5 * entry["bits"] and near["also_helpful"]
 
 
-HOT_END = BELIEF.replace("heat: {unit: W}", "heat: {unit: W}, fan: {unit: '1'}").replace(
+HOT_END = HEATED_BLOCK.replace("heat: {unit: W}", "heat: {unit: W}, fan: {unit: '1'}").replace(
     "rate: G * (T - air)", "rate: (G + 0.15 * fan) * (T - air)"
 )
 HOT_TRUTH = HOT_END.replace(
@@ -236,7 +222,7 @@ outputs: {y: {value: T}}""")
 
 
 def test_on_the_programs_own_rig_the_setpoint_is_driven(tmp_path):
-    plant = loads(BELIEF.replace("heat: {unit: W}", "heat: {unit: W, column: power_w}"))
+    plant = loads(HEATED_BLOCK.replace("heat: {unit: W}", "heat: {unit: W, column: power_w}"))
     t = np.arange(300.0)
     setpoint = 100 * (t // 50 % 3)
     table = Table(
@@ -292,7 +278,7 @@ def test_rounds_end_when_nothing_is_left_to_ask(last, tmp_path):
 @pytest.mark.slow
 def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment(tmp_path, capsys):
     """The whole way by the command line: ambiguous at 25 K; the rig in the experiment's place is simulated from the truth."""
-    (tmp_path / "plant.yaml").write_text(BELIEF)
+    (tmp_path / "plant.yaml").write_text(HEATED_BLOCK)
     (tmp_path / "truth.yaml").write_text(TRUTH)
     write_table(tmp_path / "run_1.csv", compile_plant(loads(TRUTH), ()).measure(short_pulses(), seed=1))
     common = [

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.plants import HEATED_BLOCK, HEATED_RADIATES
 from thermoctl.diagnosis.run import diagnose_files
 from thermoctl.plant import loads
 from thermoctl.plant.simulation.simulate import compile_plant
@@ -19,17 +20,6 @@ spec = importlib.util.spec_from_file_location("make", ROOT / "docs/examples/heat
 make = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(make)
 HEADER = "t,heat,air_temperature,temperature_1,temperature_2"
-BLOCK = """format: thermoctl-plant/1
-title: Heated block
-inputs: {heat: {unit: W}, air: {unit: degC}}
-parameters: {C: {value: 40, unit: J/K, range: [20, 80]}, G: {value: 0.25, unit: W/K, range: [0.05, 1]}}
-nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.05}}
-flows: {power: {into: T, rate: heat, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
-outputs: {T_block: {value: T, unit: degC, noise: 0.2}}
-"""
-RADIATES = BLOCK.replace(
-    "flows: {", "flows: {missing: {from: T, rate: 2.5e-9 * ((T + 273.15)**4 - (air + 273.15)**4), unit: W}, "
-)
 # Rectangles of all visible texts, each with what cuts it: the page's edge, the drawing or the box that it is in; letters below 9 px.
 LOOK = """(() => {
   const texts = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), faults = [];
@@ -83,8 +73,9 @@ def recorded(name, folder, monkeypatch):
         t = np.arange(240) * 5.0
         heat = np.where((np.abs(t - 156) < 75) | (np.abs(t - 736) < 75), 20.0, 0.0)
         table = Table("run_1", "run_1", t, {"heat": heat, "air": np.full(len(t), 22.0)})
-        (folder / "plant.yaml").write_text(BLOCK)
-        write_table(folder / "run_1.csv", compile_plant(loads(RADIATES), ()).measure(table, seed=1))
+        plant, truth = (b.replace("noise: 0.05", "noise: 0.2") for b in (HEATED_BLOCK, HEATED_RADIATES))
+        (folder / "plant.yaml").write_text(plant)
+        write_table(folder / "run_1.csv", compile_plant(loads(truth), ()).measure(table, seed=1))
         return folder / "plant.yaml", [folder / "run_1.csv"]
     monkeypatch.setattr(make, "LAMP_W", make.LAMP_W if name == "explained" else 0.0)
     paths = [folder / f"run_{seed}.csv" for seed in ((1, 2, 3) if name == "explained" else (1, 2))]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from tests.plant.test_plant_refit import BLOCK, TRUTH, recorded
 from thermoctl.cli import main
 from thermoctl.files.yamlfile import InputError
 from thermoctl.identify.linearise import discrete, linearise, thermal
@@ -129,28 +130,11 @@ def test_layout_keeps_the_lengths_of_a_chain():
     assert np.linalg.norm(np.diff(x, axis=0), axis=1) == pytest.approx(np.ones(4), abs=0.05)
 
 
-BLOCK = """format: thermoctl-plant/1
-inputs: {P: {unit: W}, air: {unit: degC}}
-parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}
-nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}}
-flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: G * (T - air), unit: W}}
-outputs: {y: {value: T, unit: degC, noise: 0.1}}
-"""
-
-
 @pytest.fixture
 def block(tmp_path):
     (tmp_path / "p.yaml").write_text(BLOCK)
-    plant, rng = load(tmp_path / "p.yaml"), np.random.default_rng(1)
-    for name in ("a", "b"):
-        t = np.arange(600.0)
-        table = Table(
-            name, name, t, {"P": 6.0 * rng.integers(0, 2, 12).repeat(50), "air": np.full(600, 21.0)}
-        )
-        table.columns["y"] = compile_plant(plant).simulate(table, {"C": 46.0, "G": 0.31}).y[
-            :, 0
-        ] + rng.normal(0, 0.1, 600)
-        write_table(tmp_path / f"{name}.csv", table)
+    for seed, name in enumerate("ab"):
+        write_table(tmp_path / f"{name}.csv", recorded(TRUTH, 600, name, seed))
     return tmp_path
 
 

@@ -18,15 +18,19 @@ from thermoctl.recording.table import Table
 
 BLOCK = """format: thermoctl-plant/1
 inputs: {P: {unit: W}, air: {unit: degC}}
-parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}EXTRA}
+parameters: {C: {value: 30, unit: J/K, range: [10, 90]}, G: {value: 0.5, unit: W/K, range: [0.1, 1]}}
 nodes: {T: {unit: degC, storage: C, initial: air, initial_sigma: 0.5}}
-flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: "LOSS", unit: W}}
+flows: {heat: {into: T, rate: P, unit: W}, loss: {from: T, rate: "G * (T - air)", unit: W}}
 outputs: {y: {value: T, unit: degC, noise: 0.1}}
 """
 
 
+def text(extra, loss):
+    return BLOCK.replace("[0.1, 1]}", f"[0.1, 1]}}{extra}").replace("G * (T - air)", loss)
+
+
 def plant(extra="", loss="G * (T - air)", noise="noise: 0.1"):
-    return loads(BLOCK.replace("EXTRA", extra).replace("LOSS", loss).replace("noise: 0.1", noise))
+    return loads(text(extra, loss).replace("noise: 0.1", noise))
 
 
 def recorded(truth, n=900, name="a", seed=1, noise=0.1, phi=0.0, step=None):
@@ -86,10 +90,10 @@ def test_two_of_which_only_the_sum_is_felt_are_flat_and_trade():
 
 def test_the_command_says_all_of_it(tmp_path, capsys):
     (tmp_path / "p.yaml").write_text(
-        BLOCK.replace(
-            "EXTRA",
+        text(
             ", H: {value: 0.3, unit: W/K, range: [0.02, 1]}, K: {value: 1, unit: W/K, range: [0.1, 5]}",
-        ).replace("LOSS", "(G + H) * (T - air) + K * max(T - 500, 0)")
+            "(G + H) * (T - air) + K * max(T - 500, 0)",
+        )
     )
     for name, seed in (("a", 1), ("b", 2)):
         write_table(tmp_path / f"{name}.csv", recorded(TRUTH, name=name, seed=seed))
