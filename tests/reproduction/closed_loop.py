@@ -16,7 +16,7 @@ import numpy as np
 
 from tests.reproduction import paper
 from tests.reproduction.plants import HEATED, quasi_static
-from tests.reproduction.rigs import PAPER_SCALE
+from tests.reproduction.rigs import PAPER_SCALE, Simulated
 from thermoctl import plant
 from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
@@ -72,7 +72,7 @@ def quasi_static_run(
     schedule: experiments.Schedule,
     seed: int,
     compensation_um: np.ndarray | float = 0.0,
-) -> Recorded:
+) -> Simulated:
     """Simulate the quasi-static plant on a full run's schedule and air, with its instruments.
 
     The coil moves by the schedule minus `compensation_um` (N,), the law's correction. A correction of 15 um
@@ -106,19 +106,19 @@ def quasi_static_run(
 
     measured = np.column_stack([read(true_c[:, j], f"{q}_c") for j, q in enumerate(POINTS)])
     error = read(true_um, "output_reference_um") - read(np.zeros(n), "position_um")
-    return Recorded(
+    return Simulated(
         test.t,
         sim.y[:, names.index("power_w")],
         test.air_c,
         measured,
         error - error[:5].mean(),
+        schedule.at(test.t),
         true_c,
         true_um,
-        schedule.at(test.t),
     )
 
 
-def agreement(full: Recorded, quasi: Recorded) -> dict[str, float]:
+def agreement(full: Recorded, quasi: Simulated) -> dict[str, float]:
     """Compare the quasi-static run of a test with the full one.
 
     Temperature and position, rms and largest, and the energies' ratio.

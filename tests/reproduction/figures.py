@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tests.reproduction import paper
+from tests.reproduction.rigs import Simulated
 from tests.reproduction.seeds import Kept
 from thermoctl.calibration import chain
 from thermoctl.calibration.recorded import Recorded, filled
@@ -55,7 +56,7 @@ def _axes(n: int = 1, high: float = 2.6) -> tuple[Figure, list[Axes]]:
     return fig, list(fig.subplots(n, 1, squeeze=False)[:, 0])
 
 
-def _step(r: Recorded) -> str:
+def _step(r: Simulated) -> str:
     fig, (a,) = _axes()
     for j in (0, 10):
         a.plot(r.t / 60, r.temperatures[:, j] - r.air_c, lw=0.7, label=POINTS[j])
@@ -90,7 +91,7 @@ def _singular_values(c: paper.Calibration) -> str:
     )
 
 
-def _errors(r: Recorded, estimates: Mapping[str, np.ndarray], caption: str) -> str:
+def _errors(r: Simulated, estimates: Mapping[str, np.ndarray], caption: str) -> str:
     truth = r.true_c - chain.smooth_air(r.air_c)[:, None]
     fig, (top, *rest) = _axes(1 + len(estimates), 2.2)
     for j in SHOWN:

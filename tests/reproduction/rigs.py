@@ -57,6 +57,14 @@ CALIBRATED_S = 7200.0  # end of test 4A in test 4
 FINE = 10  # steps of the motion in a second
 
 
+@dataclass(frozen=True)
+class Simulated(Recorded):
+    """A test of a simulated rig, with the truth: temperatures true_c (N, points), position error true_um (N,)."""
+
+    true_c: np.ndarray
+    true_um: np.ndarray
+
+
 def _outside_heat(t: np.ndarray, late: np.ndarray, columns: dict[str, np.ndarray]) -> None:
     """Heat the stator with 0.4 W for 75 minutes."""
     columns["heat_outer_stator"] = columns["heat_outer_stator"] + 0.4 * (late & (t > 9000) & (t < 13500))
@@ -150,7 +158,7 @@ class ProvingRig:
             self.base[k] *= factor
         self.meter_gain = 1 + METER_SPREAD * rng.standard_normal()
 
-    def run(self, schedule: Schedule, day: int, noise: bool = True) -> Recorded:
+    def run(self, schedule: Schedule, day: int, noise: bool = True) -> Simulated:
         """Simulate a test at 1 s.
 
         `noise` False: the same day with perfect instruments and without the unmeasured heat."""
@@ -210,7 +218,7 @@ class ProvingRig:
             rows[k] = (before if k < day.changed_from else after).step(u[k])
         return rows
 
-    def _read(self, day: _Day, schedule: Schedule, noise: bool) -> Recorded:
+    def _read(self, day: _Day, schedule: Schedule, noise: bool) -> Simulated:
         """Return the readings of the rig's instruments from the plant's outputs."""
         y, rng, d = self._simulated(day), day.rng, self.disturbance
         true_c, true_um = y[:, self.order[:-1]], y[:, self.order[-1]] - y[0, self.order[-1]]
@@ -231,7 +239,7 @@ class ProvingRig:
             error = _stepped(error + ENCODER_NOISE_UM * rng.standard_normal(len(error)), ENCODER_STEP_UM)
             air = _stepped(air + AIR_NOISE_C * rng.standard_normal(len(air)), AIR_STEP_C)
         power = y[:, self.power] * self.meter_gain + METER_NOISE_W * rng.standard_normal(len(air))
-        return Recorded(day.t, power, air, measured, error, true_c, true_um, schedule.at(day.t))
+        return Simulated(day.t, power, air, measured, error, schedule.at(day.t), true_c, true_um)
 
     def bayes(self, schedule: Schedule, day: int, recorded: Recorded) -> np.ndarray:
         """Estimate the position error (N,) with the best possible filter: a bound for all methods.

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from tests.reproduction import paper
-from tests.reproduction.rigs import CALIBRATED_S, CHAMBER, PAPER_SCALE, PROOF_DAY, ProvingRig, joined
+from tests.reproduction.rigs import (
+    CALIBRATED_S,
+    CHAMBER,
+    PAPER_SCALE,
+    PROOF_DAY,
+    ProvingRig,
+    Simulated,
+    joined,
+)
 from thermoctl import plant
 from thermoctl.calibration import chain
 from thermoctl.calibration.iso230 import mean_and_two_s
@@ -43,7 +51,7 @@ class Kept:
     """
 
     calibration: paper.Calibration
-    tests: tuple[Recorded, Recorded, Recorded, Recorded]
+    tests: tuple[Simulated, Simulated, Simulated, Simulated]
     estimate: dict[str, np.ndarray]  # rises in test 3
     truth: np.ndarray
     residual: dict[str, np.ndarray]  # position error in test 4 less each estimate
@@ -67,7 +75,7 @@ def one_seed(
     rig = ProvingRig(plant.load(plant_file), seed, disturbance, PAPER_SCALE, air, bench, heat)
     run4 = joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, PROOF_DAY)
-    r4a = Recorded(*(getattr(r4, f.name)[:CALIBRATION] for f in dataclasses.fields(r4)))
+    r4a = Recorded(*(getattr(r4, f.name)[:CALIBRATION] for f in dataclasses.fields(Recorded)))
     c = paper.calibrate(r2, r3, r4a)
     with np.errstate(over="ignore", invalid="ignore"):
         residual = {k: r4.true_um - v for k, v in paper.estimates(c, r4).items()}

@@ -97,7 +97,7 @@ def proof():
     )
     run4 = rigs.joined(tests["test_4a"], tests["test_4b"], "test_4")
     r2, r3, r4 = rig.run(tests["test_2"], 1), rig.run(tests["test_3"], 2), rig.run(run4, 4)
-    r4a = Recorded(*(getattr(r4, f.name)[:7200] for f in dataclasses.fields(r4)))
+    r4a = Recorded(*(getattr(r4, f.name)[:7200] for f in dataclasses.fields(Recorded)))
     return rig, run4, r4, paper.calibrate(r2, r3, r4a)
 
 

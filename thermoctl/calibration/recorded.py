@@ -39,30 +39,24 @@ class Recorded:
 
     Temperatures (N, points) degC as read (NaN: no reading).
 
-    error_um is the difference of the two encoders. A simulated rig adds the truth: true_c
-    (N, points), true_um (N,)."""
+    error_um is the difference of the two encoders."""
 
     t: np.ndarray
     power_w: np.ndarray
     air_c: np.ndarray
     temperatures: np.ndarray
     error_um: np.ndarray
-    true_c: np.ndarray
-    true_um: np.ndarray
     setpoint_um: np.ndarray
 
 
 def of_columns(t: np.ndarray, columns: Mapping[str, np.ndarray], points: Sequence[str]) -> Recorded:
     """Take the signals at 1 s as one test of a rig with these points.
 
-    The position error is relative to its start. The true temperatures are unknown: NaN."""
+    The position error is relative to its start."""
     temperatures = np.column_stack([columns[f"{p}_c"] for p in points])
     error = columns["output_reference_um"] - columns["position_raw_um"]
     error = error - np.nanmean(error[:SETTLED])
-    unknown = np.full(temperatures.shape, np.nan)
-    return Recorded(
-        t, columns["power_w"], columns["air_c"], temperatures, error, unknown, error, columns["setpoint_um"]
-    )
+    return Recorded(t, columns["power_w"], columns["air_c"], temperatures, error, columns["setpoint_um"])
 
 
 def read(path: str | Path, points: Sequence[str]) -> Recorded:
