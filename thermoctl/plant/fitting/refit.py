@@ -287,6 +287,3 @@ def _result(problem: Problem, top: Climbed[Found]) -> Fit:
         converged=top.converged,
         left=2 * top.left,
     )
-
-
-# --------------------------------------------------------------------------------------------------- reports
