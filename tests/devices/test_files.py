@@ -414,7 +414,13 @@ TORQUE = "[6071]\nObjectType=7\nDataType=3\n"
         (MORE, ", 0x2022", "has sub-indices; say which, as 0x2022:1"),
         (MORE, ", '0x2022:2'", "has no sub-index 2; it has 1"),
         (MORE, ", 0x3000", "0x3000 is not in it"),
-        ("[6077]\nDataType=9\n", ", 0x6077", "no whole number of up to 4 bytes"),
+        ("[6077]\nDataType=9\n", ", 0x6077", r"\(line 12\) is no whole number of up to 4 bytes"),
+        (
+            "[6077]\nDataType=3\nPDOMapping=0x0\n",
+            ", 0x6077",
+            r"\(line 12\) has PDOMapping=0: no PDO can hold",
+        ),
+        ("[2100]\nDataType=3\nPDOMapping=0\nCompactSubObj=2\n", ", '0x2100:1'", "has PDOMapping=0"),
     ],
 )
 def test_what_a_drive_names_must_be_sound_in_its_eds(tmp_path, more, named, words):
@@ -539,6 +545,14 @@ def test_a_number_that_the_file_names_as_no_value_is_none(tmp_path, fault):
     for raw in range(240, 256):
         status = read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]]
         assert status == (ERROR if raw > 255 - len(words) else OK), raw
+
+
+@pytest.mark.parametrize("stated", [-32768, 32768])
+def test_no_value_of_a_signed_signal_may_be_stated_as_its_bits(tmp_path, stated):
+    """The bits were a number that the signal cannot have, so that -327.68 V was a reading."""
+    dev = device(tmp_path, START + GOOD + f'VAL_ 801 Volts {stated} "SNA" ;\n', [V], "{v: voltage_v}")
+    for data, status in ((b"\x00\x80", ERROR), (b"\x01\x80", OK)):
+        assert read(dev, (801, data.ljust(8, b"\0"))).status[ROLE["voltage_v"]] == status
 
 
 def test_the_error_of_a_state_is_a_reading(tmp_path):

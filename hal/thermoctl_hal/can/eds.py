@@ -1,6 +1,6 @@
 """Read the types of objects from an EDS file (CiA 306); only those that a profile names must be sound.
 
-Of each section `[6041]` or `[1A00sub3]` name, ObjectType, DataType, AccessType and the limits count. Other
+Of each section `[6041]` or `[1A00sub3]` name, types, AccessType, PDOMapping and the limits count. Other
 lines, and faults in them, are passed over with one warning.
 """
 
@@ -48,6 +48,11 @@ class Entry:
     def access(self) -> str:
         """Return ro, wo, rw, rwr, rww or const; '' where the file does not state it."""
         return _plain(self.keys.get("accesstype", "")).lower()
+
+    @property
+    def in_pdo(self) -> bool:
+        """Return whether a PDO may hold the object: the file does not state PDOMapping=0."""
+        return _number(self.keys.get("pdomapping", "1")) != 0
 
     @property
     def limits(self) -> tuple[float, float]:

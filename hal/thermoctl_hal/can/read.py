@@ -75,7 +75,9 @@ def read_signal(s: Section, spec: BusSpec) -> DbcSource:
     sentinels = tuple(_raw_sentinel(n, signal) for n in k["sentinels"] or ())
     choices: Mapping[Any, object] = {} if signal.is_float else signal.choices or {}
     named_so = _NO_QUANTITY.search if signal.unit else _NO_VALUE.fullmatch
-    sentinels += tuple(float(raw) for raw, word in choices.items() if named_so(str(word)))
+    none = [int(raw) % (1 << signal.length) for raw, word in choices.items() if named_so(str(word))]
+    high = whole_range(signal.length, signal.is_signed)[1]  # a file may state the bits of a negative number
+    sentinels += tuple(float(raw if raw <= high else raw - (1 << signal.length)) for raw in none)
     bits = 0 if signal.is_float or signal.is_signed or not dbc.is_j1939(message) else signal.length
     absent = range(0xFE << bits - 8, 1 << bits) if bits in (8, 16, 24, 32) else range(0)  # SAE J1939-71
     return DbcSource(message, signal.name, invalid, sentinels, absent)

@@ -92,15 +92,17 @@ class Objects:
         self._check_access(item, key, entry)
         letter = _FORMATS.get(entry.data_type)
         if letter is None:
-            raise self._error(item, key, f"({entry.name}) is no whole number of up to 4 bytes")
+            raise self._error(item, key, f"(line {entry.line}) is no whole number of up to 4 bytes")
         return letter
 
     def _check_access(self, item: Object, key: str, entry: Entry) -> None:
-        """Raise InputError for an object that is read but cannot be, or written but cannot be."""
+        """Raise InputError for an object that is read, written or mapped but cannot be."""
         sent = key == "transmit"
         if entry.access in (("wo",) if sent else ("ro", "const")):
             what = f"({entry.name}, line {entry.line}) has AccessType={entry.access}: it cannot be "
             raise self._error(item, key, what + ("sent" if sent else "written"))
+        if key in ("transmit", "command") and not entry.in_pdo:
+            raise self._error(item, key, f"(line {entry.line}) has PDOMapping=0: no PDO can hold it")
 
     def within(self, item: Object, key: str, low: float, high: float) -> None:
         """Raise InputError where values from low to high are outside the limits of the object's EDS file."""
