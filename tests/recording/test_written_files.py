@@ -192,8 +192,8 @@ def test_lakhs_and_times_of_unknown_form(tmp_path):
         100000.5,
         99999.5,
     ]
-    with pytest.raises(InputError, match="no time in a form that is known: 'Elapsed': 'PT0S'"):
-        read(tmp_path, table("Elapsed,T", "PT0S,20", "PT30S,21", "PT1M,22"))
+    with pytest.raises(InputError, match="no time in a form that is known: 'Elapsed': '0 beats'"):
+        read(tmp_path, table("Elapsed,T", "0 beats,20", "30 beats,21", "60 beats,22"))
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,10 @@ from thermoctl.recording.foreign.units import WORDS, known, scale_between, spell
 
 MISSING = frozenset({"", *(w.strip() for w in WORDS["missing"].split("|"))})
 """Cells that mean "no value", in lower case."""
-_MARKS = r"^(?:[-+*?.=_~–—∞]+|[-+]?\d\.#\w+)$"
+_MARKS = r"^(?:[-+*?.=_~–—∞]+|#{2,}|[-+]?\d\.#\w+)$"
 """Cells of marks only, as loggers write them out of range, and NaN as Windows prints it, such as -1.#J."""
+_AROUND = r"^[-+*\[(<{]+([^\W\d].*?)[-+*\])>}]*$"
+"""A word between marks: `[N/A]`, `-----OL-----`."""
 _NO_READING = 9.9e37  # devices with SCPI send this and larger numbers for "overload" and "no value"
 _CODES = re.compile(
     r"-99|-?9{3,}|-?99+\.9+|-?[67]999|85|-127|32767|-32768|65535|327\.67|-327\.68|3276\.7|-3276\.8|655\.35|6553\.5"
@@ -63,7 +65,8 @@ class CellError(Exception):
 
 def is_missing(cell: str) -> bool:
     """Return whether a cell means "no value"."""
-    return cell.strip().lower() in MISSING or re.match(_MARKS, cell.strip()) is not None
+    word = cell.strip().lower()
+    return word in MISSING or re.sub(_AROUND, r"\1", word) in MISSING or re.match(_MARKS, word) is not None
 
 
 def is_number(cell: str) -> bool:
@@ -144,7 +147,9 @@ def words(texts: pa.Array, also_missing: Collection[str] = ()) -> tuple[pa.Array
     tidy = _tidied(texts)
     lower = pc.utf8_lower(tidy)
     spellings = sorted(MISSING | {m.strip().lower() for m in also_missing})
-    missing = pc.fill_null(pc.is_in(lower, pa.array(spellings)), True)
+    bare = pc.replace_substring_regex(lower, _AROUND, r"\1")
+    known_words = (pc.is_in(w, pa.array(spellings)) for w in (lower, bare))
+    missing = pc.fill_null(pc.or_(*known_words), True)
     missing = pc.or_(missing, pc.fill_null(pc.equal(tidy, ""), True))
     missing = pc.or_(missing, pc.fill_null(pc.match_substring_regex(tidy, _MARKS), False))
     shown = pc.unique(pc.drop_null(tidy.filter(missing))).to_pylist()

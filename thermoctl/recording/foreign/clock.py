@@ -46,6 +46,7 @@ _SPELLINGS = tuple(
         (r"^(\d\S*[T ]\d{1,2}:\d{2}(?::[\d.]+)?Z?)(?:/| - )\d.*$", r"\1"),  # from one time to another
         (r"([ap])\.\s?m\.", r"\1m"),
         (r"(?:上午|午前|오전)\s*(\d[\d:.]*)", r"\1 AM"),
+        (r"(^|\s)([AaPp][Mm])\s*(\d[\d:.]*)$", r"\1\3 \2"),
         (r"(?:下午|午後|오후)\s*(\d[\d:.]*)", r"\1 PM"),
         (r"^(\d{1,2}:\d{2}\S*(?: [AaPp][Mm])?),? (\d{1,4}[-/.](?:\d{1,2}|{L}{3,})[-/.]\d{2,4})$", r"\2 \1"),
         (r"^({L}{3}){L}*\.?\s+(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2}\S*)\s+(\d{4})$", r"\2-\1-\4 \3"),
@@ -64,7 +65,7 @@ _SPELLINGS = tuple(
         (r"^(\d{4}:\d{2}:\d{2}) (\d)", r"\1T\2"),
         (r"\.(Z?)$", r"\1"),
         (r"^(\d{1,2})/(\d{1,2})\s+(\d{1,2}:\d{2}:\d{2})$", r"1900-\1-\2 \3"),  # EnergyPlus states no year
-        (r"^(\d{1,3}) (\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)$", r"\1d \2"),  # Hioki
+        (r"^(\d{1,4})[. ](\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)$", r"\1d \2"),  # .NET, Hioki
         (r"(^|[^\d:])(\d{1,4}):(\d):(\d)", r"\1\2:0\3:\4"),  # 9:5:3 of an Arduino
         (r"(^|[^\d:])(\d{1,4}:\d{2}):(\d)($|\D)", r"\1\2:0\3\4"),
         (r"^(\d{1,3}):(\d{2})([.,]\d+)$", r"0:\1:\2\3"),
@@ -77,9 +78,16 @@ _SPELLINGS = tuple(
 # Names that tell hours from minutes.
 _TOLD = re.compile(r"(?i)m+(?:in\w*)?:s|h+(?:ours?|rs?)?:m|uhr|of.?day|local|utc|gmt")
 _DURATION = r"^(?P<sign>-)?(?P<d>\d+) ?d(?:ays?)?,? *(?P<rest>\d{1,2}:\d{2}.*)$"
+# PT1M30S of ISO 8601, `1h 2m`, 2m30s: two parts, as 5m may be a length.
+_PARTS = (
+    r"^P?(?:(?P<d>\d+)\s?[Dd][a-z]*)?[T,\s]*(?:(?P<h>\d+)\s?[Hh][a-z]*)?[,\s]*(?:(?P<m>\d+)\s?(?:M|m|[Mm]in[a-z]*))?"
+    r"[,\s]*(?:(?P<s>\d+(?:\.\d+)?)\s?[Ss][a-z]*)?$"
+)
+_PARTED = r"^P[T\d].*[A-Z]$|^\d+\s?[DdHhMm][a-z]*[,\s]*\d"
 _MAYBE = re.compile(r"\d\D+\d|\d\D*[^\W\d_]{3}|[^\W\d_]{3}\W*\d")
 _ONE_SPELLINGS = tuple((re.compile(p), by) for p, by in _SPELLINGS)
 _ONE_TIME, _ONE_DURATION = re.compile(_PATTERN), re.compile(_DURATION)
+_ONE_PARTS, _ONE_PARTED = re.compile(_PARTS), re.compile(_PARTED)
 # A number's epoch: name, seconds of a count, its zero in seconds since 1970, least and largest count.
 _1904, _1601, _1899 = -2_082_844_800.0, -11_644_473_600.0, -2_209_161_600.0
 EPOCHS = (
@@ -218,7 +226,11 @@ def tidied(texts: pa.Array) -> pa.Array:
 def is_time(cell: str) -> bool:
     """Return whether a cell is a date, a time of day, both, or a duration of days and a time."""
     text = cell.strip(" \t\"'\u00a0")
-    if not _MAYBE.search(text) or len(text) > 99:
+    if len(text) > 99:
+        return False
+    if _ONE_PARTED.match(text) and _ONE_PARTS.match(text):
+        return True
+    if not _MAYBE.search(text):
         return False
     for pattern, by in _ONE_SPELLINGS:
         text = pattern.sub(by, text)
@@ -235,9 +247,15 @@ def times(texts: pa.Array) -> np.ndarray:
     tidy = tidied(texts)
     right = pc.or_(
         pc.and_(pc.match_substring_regex(tidy, _PATTERN), pc.match_substring_regex(texts, r"\D")),
-        pc.match_substring_regex(tidy, _DURATION),
+        pc.or_(pc.match_substring_regex(tidy, _DURATION), _are_parted(texts)),
     )
     return np.array(pc.and_(right, pc.not_equal(tidy, "")).to_numpy(zero_copy_only=False), dtype=bool)
+
+
+def _are_parted(texts: pa.Array) -> pa.Array:
+    """Return which cells are durations such as `1h 2m` and PT30S."""
+    texts = pc.utf8_trim_whitespace(texts)
+    return pc.and_(pc.match_substring_regex(texts, _PARTED), pc.match_substring_regex(texts, _PARTS))
 
 
 def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Seconds:
@@ -333,11 +351,13 @@ def from_texts(texts: pa.Array) -> Seconds:
     empty = pc.fill_null(pc.equal(pc.utf8_trim_whitespace(texts), ""), True)
     if pc.any(empty).as_py():
         raise ClockError(pc.index(empty, True).as_py(), "the time is missing; a date or time was expected")
-    if (quick := _iso(texts)) is not None:
+    if (quick := _iso(texts) or _of_parts(texts)) is not None:
         return quick
     tidy = tidied(texts)
     if _with_points(tidy):
         tidy = pc.replace_substring(tidy, ".", ":")
+    if pc.any(pc.match_substring_regex(tidy, _DURATION)).as_py():
+        tidy = pc.replace_substring_regex(tidy, r"^(\d{1,2}:\d{2}:)", r"0d \1")  # .NET leaves out 0 days
     if pc.all(pc.match_substring_regex(tidy, _DURATION)).as_py():
         parts = pc.extract_regex(tidy, _DURATION)
         t = _whole(parts.field("d")) * DAY_S + _clock_ns(_fields(parts.field("rest"))) / 1e9
@@ -397,6 +417,19 @@ def _iso(texts: pa.Array) -> Seconds | None:
         ns = ns.to_numpy(zero_copy_only=False)
         return _since(ns, "year-month-day", zone is not None, bool(np.any(ns % DAY_NS)))
     return None
+
+
+def _of_parts(texts: pa.Array) -> Seconds | None:
+    """Return durations such as `1h 2m` and PT30S as seconds; None where one is no such text."""
+    if not pc.all(_are_parted(texts)).as_py():
+        return None
+    parts = pc.extract_regex(pc.utf8_trim_whitespace(texts), _PARTS)
+    day, hour, minute, second = (
+        pc.if_else(pc.equal(parts.field(k), ""), "0", parts.field(k)).cast(pa.float64()).to_numpy()
+        for k in "dhms"
+    )
+    t = day * DAY_S + hour * HOUR_S + minute * 60.0 + second
+    return Seconds(t, None, "durations of days, hours, minutes, seconds", "duration")
 
 
 def _since(ns: np.ndarray, order: str, zoned: bool, timed: bool = True) -> Seconds:

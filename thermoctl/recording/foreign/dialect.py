@@ -47,6 +47,9 @@ _HEADER_END = re.compile(r"\*{3}End_of_Header\*{3}|Nb header lines\W+(\d+)")
 _TWO = re.compile(r"[-+]?[\d.]+(?: [-+]?[\d.]+)+$")  # numbers between single blanks
 _COMMA = re.compile(r"[-+]?(\d+,\d+|,\d+)([eE][-+]?\d+)?$")
 _STATED = re.compile(r"[A-Za-z][^,;\t|:=]{0,60}?\s[:=]\s+\S")  # `Channel : RPM` above a table
+_UNSEEN = re.compile(
+    "[\u200b\u200e\u200f\u202a-\u202e\u2066-\u2069]"
+)  # marks of direction, as Windows copies dates
 _DECIMALS = re.compile(r"[-+]?\d*[.,]\d+$")
 _AMBIGUOUS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}$")
 _THOUSANDS = re.compile(rb"\.(?<!:\d\d\.)\d{3}(?=[;\t\r\n])")  # the end of 1.050 in a cell
@@ -101,7 +104,7 @@ def decoded(path: Path, data: bytes) -> tuple[bytes, tuple[str, ...]]:
         raise InputError(
             f"{path}: not text in UTF-8, UTF-16 or a code page that its words show; save it as UTF-8"
         )
-    whole, notes = _whole_lines(text.encode("utf-8"))
+    whole, notes = _whole_lines(_UNSEEN.sub("", text).encode("utf-8"))
     if encoding == "utf-8":
         return whole, notes
     name = next((name for name, e in ENCODINGS.items() if e == encoding), encoding[:6].upper())
@@ -168,9 +171,8 @@ def cells_of(line: str, separator: str) -> list[str]:
     """Return the cells of one line, unquoted and stripped."""
     if separator in ("  ", " "):
         if '"' in line:
-            return [
-                c.strip() for c in next(csv.reader([line.strip()], delimiter=" ", skipinitialspace=True), [])
-            ]
+            line = re.sub(r'^\s*\((".*")\)\s*$', r"\1", line.strip())  # the header of Fluent
+            return [c.strip() for c in next(csv.reader([line], delimiter=" ", skipinitialspace=True), [])]
         return re.split(r"\s{2,}|\t" if separator == "  " else r"\s+", line.strip())
     cells = [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
     return [c[1:-1] if len(c) > 1 and c[0] == c[-1] == '"' else c for c in cells]
@@ -603,7 +605,8 @@ def _commented(comments: list[tuple[int, str]], separator: str, width: int) -> l
     for number, text in reversed(comments):
         for sep in (separator, ",", ";", "\t", "  ", " "):
             cells = cells_of(text, sep)
-            if len(cells) == width and not any(_kind(c) in "t" for c in cells) and not _STATED.match(text):
+            stated = _STATED.match(text) or (cells[0].endswith(":") and not cells[-1].endswith(":"))
+            if len(cells) == width and not any(_kind(c) in "t" for c in cells) and not stated:
                 if found:
                     return [(number, cells), *found] if _is_units(found[0][1], cells) else found
                 found = [(number, cells)]

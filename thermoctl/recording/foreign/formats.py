@@ -80,6 +80,14 @@ def _timed(
     return list(sheets.values())
 
 
+def frames(path: Path) -> InputError:
+    """Return the error of a log of CAN frames."""
+    return InputError(
+        f"{path}: frames of a CAN bus, not the signals in them; decode them by the bus's DBC file first, with "
+        "asammdf or `python -m cantools decode`"
+    )
+
+
 def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
     """Read the channels of an ASAM MDF file (3 or 4), a sheet for each clock. Raises InputError."""
     asammdf = load("asammdf", path)
@@ -94,10 +102,14 @@ def read_mdf(path: Path, notes: list[str]) -> list[Sheet]:
                 invalid = getattr(signal, "invalidation_bits", None)
                 if invalid is not None and samples.dtype.kind in "fiub":
                     samples = np.where(np.asarray(invalid, bool), np.nan, samples)
+                if samples.dtype.names and signal.name == "CAN_DataFrame":
+                    raise frames(path)
                 if signal.name not in ("t", "time"):
                     channels.append(
                         (signal.name, signal.unit or "", np.asarray(signal.timestamps), samples, start)
                     )
+    except InputError:
+        raise
     except Exception as e:  # asammdf raises any error on damaged bytes
         raise _damaged(path, "MDF", e) from None
     return _timed(path, _own_names(channels), notes)
@@ -141,14 +153,15 @@ def read_tdms(path: Path, notes: list[str], group: str | None = None) -> list[Sh
         rest = {}
         for name, (values, properties) in channels.items():
             step = properties.get("wf_increment")
+            unit = str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
             own = name if names.count(name) == 1 or (clocked and name in ("t", "t_s")) else f"{title}_{name}"
             if isinstance(step, int | float) and step > 0 and len(values) and not clocked:
                 begins = properties.get("wf_start_time")
                 start = str(np.datetime64(begins, "us")) if begins is not None else None
                 t = float(properties.get("wf_start_offset", 0.0)) + step * np.arange(len(values))
-                waves.append((own, str(properties.get("unit_string", "")), t, values, start))
+                waves.append((own, unit, t, values, start))
             else:
-                rest[own] = values, str(properties.get("unit_string", ""))
+                rest[own] = values, unit
         tables.append(_group(path, title, rest, notes))
     sheets = _timed(path, waves, notes)
     for table in tables:
@@ -371,8 +384,10 @@ def _lines(text: Any, by_column: bool) -> list[str]:
 
 
 def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
-    """Return the columns of a Parquet or Arrow file; nested ones are left out with a note."""
+    """Return the columns of a Parquet or Arrow file; lists are left out with a note."""
     sheet = Sheet({}, place_in(path), meta=own_meta(arrow.schema))
+    while any(pa.types.is_struct(f.type) for f in arrow.schema):
+        arrow = arrow.flatten()
     for name, column, kind in zip(distinct(arrow.column_names), arrow.columns, arrow.schema, strict=True):
         column = column.combine_chunks()
         column = column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
@@ -385,6 +400,7 @@ def read_arrow(path: Path, arrow: pa.Table) -> Sheet:
         elif (
             pa.types.is_string(column.type)
             or pa.types.is_large_string(column.type)
+            or pa.types.is_string_view(column.type)
             or pa.types.is_time(column.type)
         ):
             values = pc.fill_null(column.cast(pa.string()), "")

@@ -46,6 +46,27 @@ MAGIC = (
     (b"\x1f\x8b", "gzip"),
     (b"LOGG", "frames"),
 )
+# Files that are no tables, by their first bytes, and what to do with them.
+_NO_TABLES = (
+    (b"SQLite format 3", "an SQLite database; export its table as CSV"),
+    (b"\x93NUMPY", "an array of NumPy, which has no names; save it with names as .mat or .csv"),
+    (b"\x80\x04\x95", "a pickle of Python; save the table as Parquet or CSV"),
+    (b"\x80\x05\x95", "a pickle of Python; save the table as Parquet or CSV"),
+    (b"\xfd7zXZ", "an xz archive; unpack it"),
+    (b"BZh", "a bzip2 archive; unpack it"),
+    (b"\x28\xb5\x2f\xfd", "a zstd archive; unpack it"),
+    (b"7z\xbc\xaf", "a 7z archive; unpack it"),
+    (b"Rar!", "a RAR archive; unpack it"),
+    (b"FEA1", "Feather 1; save it as Feather 2, or as Parquet"),
+    (b"\x89MCAP", "MCAP; export its messages as CSV"),
+    (b"#ROSBAG", "a bag of ROS; export its topics as CSV"),
+    (b'"TOB', "binary data of Campbell; convert it to TOA5 with LoggerNet or CardConvert"),
+    (b"%PDF", "a PDF; export the table as CSV or .xlsx"),
+    (b"version https://git-lfs", "a pointer of Git LFS in place of the file; `git lfs pull` brings it"),
+    (b"<?xml", "XML; export the table as CSV"),
+    (b"<!doctype html", "a web page; save its table as CSV"),
+    (b"<html", "a web page; save its table as CSV"),
+)
 # Logs of CAN frames: Vector's .asc, PEAK's .trc, candump's.
 _FRAMES = re.compile(
     rb"(?mi)^(base (hex|dec) +timestamps|;\$FILEVERSION=|\s*(\([-\d.: ]+\)\s+\S+|[vxsl]*can\d+)\s+[0-9A-F]{3,8}(#|\s+\[\d+\]))"
@@ -84,10 +105,12 @@ def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
     """Read a file's sheets by its format."""
     kind = kind_of(path)
     how.trace.append(f"format: {kind}")
+    if how.sheet is not None and kind not in ("hdf", "tdms", "mat", "excel"):
+        notes.append(f"--sheet {how.sheet} has no effect: {kind} has no sheets")
     if kind in _READERS:
         return [_of_names(s) for s in _READERS[kind](path, how, notes)]
     if kind == "frames":
-        raise _frames(path)
+        raise formats.frames(path)
     if kind == "xls":
         raise InputError(
             f"{path}: an Excel file of before 2007, or with a password; save it as .xlsx or .csv"
@@ -102,16 +125,12 @@ def sheets_of(path: Path, how: How, notes: list[str]) -> list[Sheet]:
             data = gzip.decompress(data)
         except (OSError, EOFError) as e:
             raise InputError(f"{path}: not a whole gzip file: {e}") from None
+    start = data[:64].removeprefix(b"\xef\xbb\xbf").lstrip()
+    if (what := next((w for m, w in _NO_TABLES if start.lower().startswith(m.lower())), None)) is not None:
+        raise InputError(f"{path}: {what}")
     text, said = decoded(path, data)
     notes += said
     return _text(path, text, how, notes)
-
-
-def _frames(path: Path) -> InputError:
-    return InputError(
-        f"{path}: frames of a CAN bus, not the signals in them; decode them by the bus's DBC file first, with "
-        "asammdf or `python -m cantools decode`"
-    )
 
 
 def _of_names(sheet: Sheet) -> Sheet:
@@ -188,7 +207,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     if b"\0" in text:
         raise InputError(f"{path}: holds zero bytes; text was expected (was the file cut off?)")
     if _FRAMES.search(text[:HEAD]):
-        raise _frames(path)
+        raise formats.frames(path)
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
     text = _one_header(_with_whole_cells(text), notes)
@@ -238,24 +257,29 @@ def _one_header(text: bytes, notes: list[str]) -> bytes:
 
 
 def _without_cut(text: bytes, dialect: Dialect, notes: list[str]) -> bytes:
-    """Return the text without a last line that has no end and fewer last digits than all others.
+    """Return the text without a last line that has no end, and fewer last digits than all others.
 
-    A logger that lost power wrote `206.5` as `20`."""
+    A logger that lost power wrote `206.5` as `20`, and `"206.5"` as `"20`."""
     if text.endswith(b"\n"):
         return text
     shown = _body(text, dialect)[-SHOWN:].decode("utf-8", errors="ignore").splitlines()[1:]
-    last = [cells_of(line, dialect.separator)[-1] for line in shown if line.strip()]
+    shown = [line for line in shown if line.strip()]
+    last = [cells_of(line, dialect.separator)[-1] for line in shown]
     digits = [len(re.sub(r"^[^.,]*[.,]?", "", c)) for c in last]
-    if (
+    if not any(digits):  # whole numbers
+        digits = list(map(len, last))
+    if [line.count('"') % 2 for line in shown] == [0] * (len(shown) - 1) + [1]:
+        said = "with an open quote"
+    elif (
         len(set(digits[:-1])) != 1
         or len(last) < FEW
         or not digits[-1] < digits[0]
         or cells.is_missing(last[-1])
     ):
         return text
-    notes.append(
-        f"the last line ends in '{last[-1]}', without the digits of the others: left out (was the file cut off?)"
-    )
+    else:
+        said = "without the digits of the others"
+    notes.append(f"the last line ends in '{last[-1]}', {said}: left out (was the file cut off?)")
     return text[: text.rfind(b"\n") + 1]
 
 

@@ -165,7 +165,11 @@ def _fraction(sheet: Sheet, name: str, t: np.ndarray) -> tuple[np.ndarray, str] 
     values = sheet.columns[name]
     if not isinstance(values, np.ndarray) or values.dtype.kind != "f" or len(values) != len(t) or not len(t):
         return None
-    if not np.isfinite(values).all() or values.min() < 0 or np.any(values % 1) or np.any(t % 1):
+    if not np.isfinite(values).all() or values.min() < 0 or np.any(t % 1):
+        return None
+    if "fraction" in name.lower() and values.max() < 1:  # `Fractional Seconds` of Keithley
+        return values, "fractions of seconds"
+    if np.any(values % 1):
         return None
     stated = unit_of_time(name, sheet.units.get(name))
     is_named = [u for u, (short, words) in _FRACTION_NAMES.items() if stated == short or words.search(name)]

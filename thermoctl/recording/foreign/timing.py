@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -109,13 +108,17 @@ def _put(valued: Sheet, name: str, found: cells.Numbers) -> None:
 def _take_units(sheet: Sheet, valued: Sheet) -> None:
     """Bring each column that a column of units follows to the unit of its first row. Raises CellError.
 
-    A multimeter that changes its range writes `999.8, mV` and `1.0002, V`."""
-    for before, name in pairwise(sheet.columns):
-        values = valued.columns.get(before)
-        if name not in valued.left or not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+    A multimeter that changes its range writes `999.8, mV` and `1.0002, V`. Behind a time alone, the units
+    are those of the column that follows them: `10:00:00, C, 20.5`."""
+    names = list(sheet.columns)
+    for k, name in enumerate(names):
+        near = [
+            n for n in (*names[:k][-1:], *names[k + 1 : k + 2]) if states_unit_of(_plain(name), _plain(n))
+        ]
+        before = next((n for n in near if _is_numbers(valued.columns.get(n))), None)
+        if name not in valued.left or before is None or {*names[:k][-1:]} & valued.left.keys():
             continue
-        if not states_unit_of(_plain(name), _plain(before)):
-            continue
+        values = valued.columns[before]
         texts = pc.utf8_trim_whitespace(pc.fill_null(sheet.columns[name], ""))
         texts = pc.replace_substring_regex(texts, r"\s*(?:AC|DC)\s*", "")
         words = [w for w in pc.unique(texts).to_pylist() if w]
@@ -129,6 +132,10 @@ def _take_units(sheet: Sheet, valued: Sheet) -> None:
                 f"column '{_plain(name)}': '{words[1]}' after '{words[0]}': one unit was expected, or units that are known "
                 f"(convert '{_plain(before)}' to one)",
             )
+
+
+def _is_numbers(cells: Any) -> bool:
+    return isinstance(cells, np.ndarray) and cells.dtype.kind == "f"
 
 
 def _without(values: np.ndarray, missing: Sequence[str]) -> np.ndarray:

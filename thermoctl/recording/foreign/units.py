@@ -97,7 +97,9 @@ def split_unit(header: str) -> tuple[str, str | None]:
 
 
 def split_words(header: str) -> tuple[str, str | None]:
-    """Return name and unit of a header that also may be `Temp, °C (LGR S/N: 7)` or `Spannung in V`."""
+    """Return name and unit of a header that also may be `Temp, °C (LGR S/N: 7)` or `Spannung in V`.
+
+    HOBOlink has `Temp - °C (S-THB 10253456:1)`, COMSOL `T (degC), Point 1`."""
     text = re.sub(
         r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)", "", header.strip()
     )
@@ -106,12 +108,15 @@ def split_words(header: str) -> tuple[str, str | None]:
         name = re.sub(r"\s+in$", "", name)  # `Temperatur in °C`
         return (text, None) if name == "in" else (name, spelled(unit, name))
     name, unit = split_unit(text)
-    if (
-        unit is None
-        and (match := re.match(r"(.*?\S)(?:\s*,\s*|\s+in\s+)(\S+(?: [CF])?)$", text))
-        and known(match[2])
-    ):
+    if unit is not None:
+        return name, unit
+    bare = re.sub(r"\s*\([^()]*\d{6}[^()]*\)$", "", text)  # a serial number
+    match = re.match(r"(.*?\S)(?:\s*,\s*|\s+in\s+|\s+-\s+)(\S+(?: [CF])?)$", bare)
+    if match and known(match[2]):
         return match[1], spelled(match[2], match[1])
+    match = re.match(r"(\S.*?)\s+\(([^()]+)\),\s*(.+)$", text)  # T (degC), Point Probe 1
+    if match and known(match[2]):
+        return f"{match[1]}, {match[3]}", spelled(match[2], match[1])
     return name, unit
 
 
