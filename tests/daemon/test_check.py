@@ -55,6 +55,17 @@ def test_check_says_where_the_power_is_unknown(config, capsys, pairs, lacks):
         assert "can never trip" in said and "driven with 0 W" in said
 
 
+def test_an_empty_protection_and_a_list_for_a_role_end_in_one_line(config, capsys):
+    """Both ended in a traceback."""
+    text = config.read_text().replace(", current: current_a", "")
+    config.write_text(re.sub(r"(?m)^(protection:).*\n(?: .*\n)+", r"\1\n", text))
+    assert main(["check", str(config)]) == 1
+    assert "the coil's power is unknown" in capsys.readouterr().out
+    change(config, ("voltage: voltage_v", "voltage: [voltage_v]"))
+    assert main(["check", str(config)]) == 2
+    assert "roles: the role of 'voltage' was expected, found a list" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "old,new,message",
     [

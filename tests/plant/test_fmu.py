@@ -220,6 +220,12 @@ def test_a_map_gives_what_the_description_lacks(tmp_path):
         ("states: {block: {}}", r"map.yaml:1:\d+: .*no state 'block' \(did you mean 'block.T'\?\)"),
         ("states: {block.T: {storage: Q}}", r"map.yaml:1:\d+: storage of 'block_T': 'Q' is not known"),
         ("outputs: {reading: {nois: 1}}", r"map.yaml:1:\d+: .*'nois'"),
+        ("parameters: {C: 20}", r"map.yaml:1:17: C: keys and values such as .range: .* expected, found 20"),
+        ("inputs: {air: [1, 2]}", r"map.yaml:1:15: air: keys and values such as .* expected, found a list"),
+        (
+            "inputs: {air: {constant: x}}",
+            r"map.yaml:1:26: constant of 'air': a number was expected, found 'x'",
+        ),
     ],
 )
 def test_a_wrong_map_is_refused_with_its_line(tmp_path, text, says):

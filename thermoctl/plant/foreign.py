@@ -15,13 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from thermoctl.files.yamlfile import Node, suggest
+from thermoctl.files.yamlfile import Node, kind_of, number_of, suggest
 from thermoctl.plant.language import FORMAT
 from thermoctl.plant.native.fmu import Fmu, Variable, opened
 from thermoctl.plant.parse import RESERVED
 from thermoctl.units import dimension
 
 SECTIONS = ("title", "inputs", "states", "outputs", "parameters")
+EXAMPLES = {
+    "inputs": "{column: heat}",
+    "states": "{initial: 20}",
+    "outputs": "{column: T}",
+    "parameters": "{range: [0.1, 10]}",
+}
 EXPRESSIONS = ("storage", "initial", "value")
 PROBES = 5  # random points at which an output that is a state's reading must equal the state
 
@@ -34,7 +40,9 @@ def plant_node(path: str | Path, mapped: Node | None = None) -> Node:
         raise mapped.error("a map of an FMU was expected, with sections " + ", ".join(SECTIONS))
     for key, node in mapped.value.items():
         if key not in SECTIONS:
-            raise node.error(f"'{key}' is no section of a map{suggest(key, SECTIONS)}; {SECTIONS} are")
+            raise node.error(
+                f"'{key}' is no section of a map{suggest(key, SECTIONS)}; {', '.join(SECTIONS)} are"
+            )
     return _Plant(fmu, mapped).document()
 
 
@@ -76,6 +84,12 @@ class _Plant:
                     f"{self.fmu.path} has no {kind[:-1]} '{name}'{suggest(name, variables)}; "
                     f"there are {', '.join(variables) or 'none'}"[:600]
                 )
+            if not isinstance(entry.value, dict | None):
+                raise entry.error(
+                    f"{name}: keys and values such as {EXAMPLES[kind]} were expected, found {kind_of(entry)}"
+                )
+            if (constant := (entry.value or {}).get("constant")) is not None:
+                number_of(constant, f"constant of '{name}'")
         return {k: Node(dict(v.value or {}), v.file, v.line, v.column) for k, v in node.value.items()}
 
     def _words(self) -> set[str]:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from thermoctl.files.yamlfile import InputError, Node, Section, suggest
+from thermoctl.files.yamlfile import InputError, Node, Section, kind_of, suggest
 from thermoctl.rig.channels import DEFAULT, AxesChannels, Channels
 from thermoctl_hal.base.binding import Binding, Bound, limits_of, port_key
 from thermoctl_hal.base.profile import BinaryFrame, BusSpec, Cia402, Dbc, Modbus, Profile, Register, TextLine
@@ -125,6 +125,8 @@ def _bound(profile: Profile, name: str, role: Node, channels: Channels) -> Bound
             f"roles: {profile.model} has no channel '{name}'{suggest(name, profile.channels)}; "
             f"it has {', '.join(profile.channels)}"
         )
+    if not isinstance(role.value, str):
+        raise role.error(f"roles: the role of '{name}' was expected, found {kind_of(role)}")
     if role.value not in channels.index:
         raise role.error(
             f"roles: '{role.value}' is no role{suggest(role.value, channels.index)}; "

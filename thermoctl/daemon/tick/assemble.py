@@ -92,7 +92,7 @@ def power_warning(settings: Settings) -> str:
         return ""
     root = load(settings.path)
     section = root.value.get("protection", root)
-    place = section.value.get("power_limit_w", section) if section is not root else root
+    place = (section.value or {}).get("power_limit_w", section) if section is not root else root
     return str(
         place.error(
             f"the coil's power is unknown without {' and '.join(lacks)}: protection.power_limit_w "
