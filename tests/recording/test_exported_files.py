@@ -64,6 +64,58 @@ def test_tables_of_programs(tmp_path, lines, t, columns, units):
     assert {n: found.units[n] for n in units} == units
 
 
+LONG = {
+    "no value by name": ("time,loc,T [degC]", "{0},in,2{0}.5\n{0},out,1{0}.5", "in_T [degC]", "out_T [degC]"),
+    "two values": ("time,unit_name,T,P", "{0},a,2{0}.5,1\n{0},b,1{0}.5,2", "a_T", "b_T"),
+    "numbers of sensors": ("time,sensor_id,T", "{0},1,2{0}.5\n{0},2,1{0}.5", "sensor_id_1_T", "sensor_id_2_T"),
+    "a name that is not known": ("time,Probe,Reading", "{0},TC1,2{0}.5\n{0},TC2,1{0}.5", "TC1", "TC2"),
+    "no header": ("2026-03-01 10:00:00,a,20.5", "2026-03-01 10:00:0{0},a,2{0}.5\n2026-03-01 10:00:0{0},b,1{0}.5", "a", "b"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", LONG)
+def test_rows_of_several_sensors(tmp_path, how):
+    """They were refused with --equal-times mean as the cure, which takes the mean of two sensors."""
+    head, rows, *names = LONG[how]
+    first = [head] if "10:00" not in head else []
+    found = read(tmp_path, table(*first, *(rows.format(k) for k in ROWS)))
+    for name, low in zip(names, (20.5, 10.5), strict=True):
+        name, _, unit = name.partition(" ")
+        assert found.columns[name].tolist() == [low + k for k in ROWS]
+        assert found.units.get(name, "") == unit.strip("[]")
+
+
+def test_sensors_that_take_turns_are_not_one_column(tmp_path):
+    """T was 20, 10, 21, 11 ... with a note that `sensor` is a column of text."""
+    rows = (
+        f"{2 * k + i},{name},{low + k}" for k in ROWS for i, (name, low) in enumerate((("a", 20), ("b", 10)))
+    )
+    found = read(tmp_path, table("time,sensor,T", *rows))
+    assert found.columns["a_T"][::2].tolist() == [20 + k for k in ROWS]
+    assert found.columns["b_T"][1::2].tolist() == [10 + k for k in ROWS]
+
+
+@pytest.mark.parametrize("words", [("on", "off"), ("ok", "ok")])
+def test_states_and_remarks_name_no_sensors(tmp_path, words):
+    lines = (f"{k},{w},{k}.5" for k in ROWS for w in words)
+    with pytest.raises(InputError, match="--equal-times"):
+        read(tmp_path, table("time,state_of_door,T", *lines))
+    lines = (f"{k},{'heating' if k < 5 else 'cooling'},{k}.5" for k in ROWS)
+    assert list(read(tmp_path, table("time,item,T", *lines)).columns) == ["T"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "***BUSMASTER Ver 3.2.2***\n***HEX***\n10:00:00:0001 Rx 1 0x321 s 2 00 01\n",
+        "Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n1660,321,false,Rx,0,1,00\n",
+    ],
+)
+def test_further_logs_of_frames(tmp_path, text):
+    with pytest.raises(InputError, match="frames of a CAN bus"):
+        read(tmp_path, text)
+
+
 @pytest.mark.parametrize(
     "lines",
     [

@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.foreign import clock
+from thermoctl.recording.foreign.cells import PAIRS, is_number
 from thermoctl.recording.foreign.dialect import cells_of
 from thermoctl.recording.foreign.jsonfile import IDS, read_json
 from thermoctl.recording.foreign.sheet import Sheet, of_lists, of_records
@@ -33,6 +34,8 @@ _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*[:=]\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
+FEW = 20  # number of first rows that show whether a column is a clock
+ENOUGH = 0.75  # least share of the times at which each signal of a long table has a row
 LEAD = 65536  # number of first bytes from which the layout is found
 _GLOBAL = {"print_time", "buffer_time", "print_stall", "sysload", "cputime", "memavail", "gcodein"}
 
@@ -164,16 +167,16 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
 
 
 def pivoted(sheet: Sheet) -> list[Sheet] | None:
-    """Return a sheet for each signal of a long table (signal, time, value); None for a wide one."""
+    """Return a sheet for each signal of a long table (signal, time, value or values); None for a wide one."""
     lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
     identity = next((lower[k] for k in IDS if k in lower and _any(sheet.columns[lower[k]])), None)
     value = next((lower[k] for k in VALUES if k in lower), None)
     if identity is None and value is None:
         identity, value = _labelled_columns(sheet)
     if identity is None or value is None or identity == value:
-        return None
-    ids = _signals(identity, sheet.columns[identity])
-    if ids is None:
+        identity, value = _told_apart(sheet), None
+    ids = None if identity is None else _signals(identity, sheet.columns[identity])
+    if identity is None or ids is None:
         return None
     rest = {n: c for n, c in sheet.columns.items() if n not in (identity, value)}
     times = {n: c for n, c in rest.items() if _is_clock(c) or (named(n) > 0 and _are_numbers(c))}
@@ -189,18 +192,59 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     units = {n: c for n, c in rest.items() if states_unit_of(n, "") and not isinstance(c, np.ndarray)}
     if tags and identity.startswith("_"):
         ids = pc.binary_join_element_wise(ids, *[pc.fill_null(sheet.columns[t], "") for t in tags], "_")
+    values = [value] if value is not None else [n for n in rest if n not in times and n not in units]
     sheets = []
     for name in pc.unique(ids).to_pylist():
         if not name or name.startswith("$"):  # WinCC marks the start and the end of its run by $RT_OFF$
             continue
         rows = np.flatnonzero(pc.equal(ids, name).to_numpy(zero_copy_only=False))
         place = _places(sheet.place, rows)
-        columns = {n: _taken(c, rows) for n, c in {**times, name: sheet.columns[value], **units}.items()}
+        alone = {n for n in values if n == value or n.strip().lower() in VALUES or NO_NAME.match(n)}
+        own = {name if len(values) == len(alone) == 1 else f"{name}_{n}": n for n in values}
+        taken = {**times, **{k: sheet.columns[n] for k, n in own.items()}, **units}
+        columns = {n: _taken(c, rows) for n, c in taken.items()}
         columns = {n: c for n, c in columns.items() if n not in units or pc.any(pc.not_equal(c, "")).as_py()}
-        sheets.append(Sheet(columns, place, name=name, decimal=sheet.decimal))
+        stated = {k: sheet.units[n] for k, n in {**{n: n for n in times}, **own}.items() if n in sheet.units}
+        sheets.append(Sheet(columns, place, stated, name=name, decimal=sheet.decimal))
     if sheets:
         sheets[0].notes += sheet.notes
     return sheets or None
+
+
+def _told_apart(sheet: Sheet) -> str | None:
+    """Return the column whose words, or whose numbers by its name, tell whose reading a row is.
+
+    Each word stands at most times, once; or the name says it, and the words change from row to row.
+    Words of a state do not tell. None where no column does."""
+    times = [c for n, c in sheet.columns.items() if named(n) > 0 or _is_clock(c[:FEW])]
+    found = {}
+    for name, cells in sheet.columns.items():
+        by_name = name.strip().lower() in IDS
+        if named(name) > 0 or (isinstance(cells, np.ndarray) and not by_name):
+            continue
+        if (ids := _signals(name, cells)) is None:
+            continue
+        words = pc.unique(ids).to_pylist()
+        is_state = any({w.lower() for w in words} <= {*pair, ""} for pair in PAIRS)
+        counted = bool(len(_numbers(cells))) or all(map(is_number, words))
+        if 1 < len(words) <= len(ids) / 2 and not is_state and (by_name or not counted):
+            found[name] = ids, len(words)
+    if not times or not found:
+        return None
+    texts = (
+        pa.array(map(str, c.tolist())) if isinstance(c, np.ndarray) else pc.fill_null(c, "") for c in times
+    )
+    key = pc.binary_join_element_wise(*texts, " ")
+    often = len(key) / len(pc.unique(key)) if len(key) else 0.0
+    for name, (ids, count) in found.items():
+        at_once = often > ENOUGH * count and len(
+            pc.unique(pc.binary_join_element_wise(key, ids, "|"))
+        ) == len(key)
+        in_turn = pc.sum(pc.not_equal(ids[1:], ids[:-1])).as_py() > len(ids) / 4  # not one after the other
+        if at_once or (in_turn and name.strip().lower() in IDS):
+            sheet.notes.append(f"a long table: '{name.strip()}' tells whose reading a row is")
+            return name
+    return None
 
 
 def _any(cells: Any) -> bool:

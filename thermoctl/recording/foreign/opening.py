@@ -67,9 +67,10 @@ _NO_TABLES = (
     (b"<!doctype html", "a web page; save its table as CSV"),
     (b"<html", "a web page; save its table as CSV"),
 )
-# Logs of CAN frames: Vector's .asc, PEAK's .trc, candump's.
+# Logs of CAN frames: Vector's .asc, PEAK's .trc, BUSMASTER's, SavvyCAN's, candump's.
 _FRAMES = re.compile(
-    rb"(?mi)^(base (hex|dec) +timestamps|;\$FILEVERSION=|\s*(\([-\d.: ]+\)\s+\S+|[vxsl]*can\d+)\s+[0-9A-F]{3,8}(#|\s+\[\d+\]))"
+    rb"(?mi)^(base (hex|dec) +timestamps|;\$FILEVERSION=|\*{3}BUSMASTER|Time Stamp,ID,Extended,|"
+    rb"\s*(\([-\d.: ]+\)\s+\S+|[vxsl]*can\d+)\s+[0-9A-F]{3,8}(#|\s+\[\d+\]))"
 )
 _QUOTED = re.compile(rb'^"([^"\n]*[,;\t][^"\n]*[,;\t][^"\n]*)"\r?$', re.MULTILINE)  # a row that is one cell
 # A cell of several lines, as the header of a table that was made in Excel has them.
