@@ -208,3 +208,34 @@ def test_units_of_ni_hardware_and_frames_of_a_bus(tmp_path):
         mdf.save(tmp_path / "bus.mf4")
     with pytest.raises(InputError, match="frames of a CAN bus"):
         read_recording(tmp_path / "bus.mf4")
+
+
+@pytest.mark.parametrize(
+    "header, step, units",
+    [
+        ("时间（毫秒）,温度（℃）,功率（kW）", 1e-3, {"温度": "degC", "功率": "kW"}),
+        ("経過時間(ミリ秒),温度[℃],電力[W]", 1e-3, {"温度": "degC", "電力": "W"}),
+        ("시간(분),온도(℃),전력(W)", 60, {"온도": "degC", "전력": "W"}),
+        ("Время (мин),Температура (°С),Мощность (кВт)", 60, {"Температура": "degC", "Мощность": "kW"}),
+        ('"Время, с","Температура, °С","Ток, мА"', 1, {"Температура": "degC", "Ток": "mA"}),
+        ("Czas [godz.],T [°C],P [W]", 3600, {"T": "degC", "P": "W"}),
+        ("Tid (timmar),T (°C),P (W)", 3600, {"T": "degC", "P": "W"}),
+        ("time,T,Phase - A", 1, {}),
+    ],
+)
+def test_headers_of_other_languages(tmp_path, header, step, units):
+    """Brackets of Chinese keyboards and Cyrillic letters lost the units without a word."""
+    found = read(tmp_path, table(header, *(f"{k},2{k}.5,{k}" for k in ROWS)))
+    np.testing.assert_allclose(found.t, [step * k for k in ROWS])
+    assert {n: u for n, u in found.units.items() if n in found.columns} == units
+
+
+def test_a_header_of_two_columns_is_no_statement_of_a_unit(tmp_path):
+    """The unit of the time was 'T (°)'."""
+    assert read(tmp_path, table("time,T (°)", *(f"{k},2{k}.5" for k in ROWS))).units == {"T": "deg"}
+
+
+def test_words_in_place_of_numbers_are_shown(tmp_path):
+    """The time was listed as a column of text."""
+    with pytest.raises(InputError, match=r"columns of text: P \('1\.00x10\^3'\)$"):
+        read(tmp_path, table("time,P", *(f"{k},1.0{k}x10^3" for k in ROWS)))

@@ -49,7 +49,7 @@ def aligned(facts: dict[str, list[str]], names: list[str], units: dict[str, str]
     found = {
         n: str(spelled(unit, n))
         for n, (unit, *more) in own.items()
-        if not more and known(unit) and not {n} & units.keys() and unit not in names
+        if not more and known(unit) and not {n} & units.keys() and split_unit(unit)[0] not in names
     }
     for key, values in facts.items():
         if re.search(r"(?i)^(y_?|vert\w*[ _]?|v)?(unit|einheit)", key) and any(

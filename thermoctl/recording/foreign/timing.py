@@ -39,19 +39,21 @@ def table_of(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str]
 def _merged(path: Path, sheets: Sequence[Sheet], how: How, notes: Sequence[str]) -> Table:
     parts: list[Table] = []
     later: list[str] = []
+    words: dict[str, str] = {}
     for sheet in sheets:
         try:
             values = _valued(path, sheet, how)
         except CellError as e:
             raise InputError(f"{sheet.place(e.row)}: {e.reason}") from None
         parts += _timed(path, values, how)
+        words |= values.left
         later += values.notes
     if not parts:
         lost = f" ({'; '.join(notes)})" if notes else ""
         raise InputError(f"{path}: no channels with a time; at least one was expected{lost}")
     table = parts[0] if len(parts) == 1 else _united(path, parts)
     if not table.columns:
-        text = ", ".join(n for s in sheets for n in s.columns if not isinstance(s.columns[n], np.ndarray))
+        text = ", ".join(f"{n} ('{word[:40]}')" for n, word in words.items())
         raise InputError(f"{path}: no column of numbers beside the time; columns of text: {text or 'none'}")
     if not len(table):
         raise InputError(f"{path}: no rows; at least one sample was expected")

@@ -26,6 +26,7 @@ _UNIT = re.compile(rf"1$|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
 # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope.
 _LAST = re.compile(r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$")
+_WIDE = str.maketrans("（）［］，：％", "()[],:%")  # as Chinese and Japanese keyboards write them
 _SCALE = re.compile(r"(?i)(?:^|[\W_])(celsius|fahrenheit|kelvin)$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
@@ -78,7 +79,7 @@ def has_factor(unit: str) -> bool:
 
 def split_unit(header: str) -> tuple[str, str | None]:
     """Return name and unit of `T_block [degC]`, `T_block (degC)`, `T_block / °C`; None for no unit."""
-    text = header.strip()
+    text = header.strip().translate(_WIDE)
     match = _NAMED.match(text)
     if not match:
         word = _SCALE.search(text)  # the name keeps it
@@ -101,7 +102,9 @@ def split_words(header: str) -> tuple[str, str | None]:
 
     HOBOlink has `Temp - °C (S-THB 10253456:1)`, COMSOL `T (degC), Point 1`."""
     text = re.sub(
-        r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)", "", header.strip()
+        r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)",
+        "",
+        header.strip().translate(_WIDE),
     )
     if match := _LAST.match(text):
         name, unit = match[1] or match[4], match[2] or match[3] or match[5]
@@ -112,7 +115,7 @@ def split_words(header: str) -> tuple[str, str | None]:
         return name, unit
     bare = re.sub(r"\s*\([^()]*\d{6}[^()]*\)$", "", text)  # a serial number
     match = re.match(r"(.*?\S)(?:\s*,\s*|\s+in\s+|\s+-\s+)(\S+(?: [CF])?)$", bare)
-    if match and known(match[2]):
+    if match and known(match[2]) and not re.search(r"\s-\s+\w$", bare):  # `Phase - A`
         return match[1], spelled(match[2], match[1])
     match = re.match(r"(\S.*?)\s+\(([^()]+)\),\s*(.+)$", text)  # T (degC), Point Probe 1
     if match and known(match[2]):
