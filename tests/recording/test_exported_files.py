@@ -239,3 +239,22 @@ def test_words_in_place_of_numbers_are_shown(tmp_path):
     """The time was listed as a column of text."""
     with pytest.raises(InputError, match=r"columns of text: P \('1\.00x10\^3'\)$"):
         read(tmp_path, table("time,P", *(f"{k},1.0{k}x10^3" for k in ROWS)))
+
+
+def test_units_in_wide_brackets_below_the_names(tmp_path):
+    """The units were the names, each a column too far to the right, and a counter was the time."""
+    found = read(tmp_path, table("时间,温度,功率", "（s）,（℃）,（kW）", *(f"{k},2{k}.5,{k}" for k in ROWS)))
+    assert found.units == {"温度": "degC", "功率": "kW"}
+    assert found.columns["温度"].tolist() == [20.5 + k for k in ROWS]
+
+
+@pytest.mark.parametrize("first, head", [("{0}", "time T P"), ("10:00:0{0}", "Uhrzeit T P")])
+def test_decimal_commas_between_blanks(tmp_path, first, head):
+    """The commas were taken for separators, and a name was said to lack."""
+    found = read(tmp_path, table(head, *(first.format(k) + f" 2{k},5 {k}" for k in ROWS)))
+    assert found.t.tolist() == [*ROWS] and found.columns["T"].tolist() == [20.5 + k for k in ROWS]
+
+
+def test_a_date_without_its_year(tmp_path):
+    found = read(tmp_path, table("Zeit;T", *(f"14.03. 10:0{k};2{k},5" for k in ROWS)))
+    assert found.t.tolist() == [60 * k for k in ROWS] and found.meta["start"].startswith("1900-03-14")

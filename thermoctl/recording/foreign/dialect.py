@@ -21,6 +21,7 @@ from thermoctl.recording.foreign.cells import is_missing, is_number
 from thermoctl.recording.foreign.clock import is_time
 from thermoctl.recording.foreign.facts import aligned, facts_of, take_below
 from thermoctl.recording.foreign.units import (
+    WIDE,
     WORDS,
     has_factor,
     known,
@@ -287,8 +288,10 @@ def _separator(
 
 
 def _all_commas(sample: list[tuple[int, str]]) -> bool:
-    """Return whether each line that decides is one number with a decimal comma."""
-    return all(_COMMA.match(c[0].strip()) for _, c in _tail([(n, [line]) for n, line in sample]))
+    """Return whether each line that decides is numbers with decimal commas, one or as many as names."""
+    rows = [c[0].split() for _, c in _tail([(n, [line]) for n, line in sample])]
+    numbers = all(all(_kind(c) in "nt" for c in row) and any(map(_COMMA.match, row)) for row in rows)
+    return numbers and {1, len(sample[0][1].split())} >= {len(row) for row in rows}
 
 
 def _tail(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
@@ -354,7 +357,7 @@ def _longer_once(rows: list[tuple[int, list[str]]], width: int) -> bool:
 
 def _bare(cell: str) -> str:
     """Return the unit of a cell such as `[degC]`, `(degC)` or `in degC`."""
-    text = cell.strip()
+    text = cell.strip().translate(WIDE)
     while text[:1] + text[-1:] in ("[]", "()"):
         text = text[1:-1].strip()
     return text.removeprefix("in ").strip()

@@ -26,7 +26,7 @@ _UNIT = re.compile(rf"1$|(?:1/)?{_SYMBOL}{_POWER}(?:[*/·. ]\(?{_SYMBOL}{_POWER}
 _NAMED = re.compile(r"(.*?\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*(?:\([^()]*\))?[^()]*)\)|\s/\s*(\S+))$")
 # `Temp. °C`, `Humidity%RH`; CH1V of an oscilloscope.
 _LAST = re.compile(r"(.*[^\s,(\[/])(?:\s*(°\s?[CF]|℃|℉|%\s?RH)|\s+([Dd]eg\.? ?[CF]))$|(CH\d+)([VA])$")
-_WIDE = str.maketrans("（）［］，：％", "()[],:%")  # as Chinese and Japanese keyboards write them
+WIDE = str.maketrans("（）［］，：％", "()[],:%")  # as Chinese and Japanese keyboards write them
 _SCALE = re.compile(r"(?i)(?:^|[\W_])(celsius|fahrenheit|kelvin)$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
@@ -79,7 +79,7 @@ def has_factor(unit: str) -> bool:
 
 def split_unit(header: str) -> tuple[str, str | None]:
     """Return name and unit of `T_block [degC]`, `T_block (degC)`, `T_block / °C`; None for no unit."""
-    text = header.strip().translate(_WIDE)
+    text = header.strip().translate(WIDE)
     match = _NAMED.match(text)
     if not match:
         word = _SCALE.search(text)  # the name keeps it
@@ -104,7 +104,7 @@ def split_words(header: str) -> tuple[str, str | None]:
     text = re.sub(
         r"\s*\((?:(?:LGR|SEN|LBL)[^)]*|-|TimeStep|Hourly|Daily|Monthly|RunPeriod)\)",
         "",
-        header.strip().translate(_WIDE),
+        header.strip().translate(WIDE),
     )
     if match := _LAST.match(text):
         name, unit = match[1] or match[4], match[2] or match[3] or match[5]
