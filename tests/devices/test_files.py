@@ -537,14 +537,67 @@ def test_nested_pages_are_told_apart(tmp_path, fault):
 
 @pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
 def test_a_number_that_the_file_names_as_no_value_is_none(tmp_path, fault):
-    words = ["SNA", "Error", "Sensor defect", "Signal_ungueltig", "Invalid_Value", "Init"]
-    fine = ["no error", "highest"]
+    words = [
+        "SNA",
+        "Error",
+        "Sensor defect",
+        "Signal_ungueltig",
+        "Invalid_Value",
+        "Init",
+        "n/a",
+        "Undefined",
+        "Not valid",
+    ]
+    words += [
+        "unavailable",
+        "open_circuit",
+        "Kurzschluss",
+        "nicht verfügbar",
+        "kein Wert",
+        "Timeout",
+        "Out of range",
+    ]
+    words += ["overflow", "Signal lost", "Ersatzwert", "Not_plausible"]
+    fine = ["no error", "highest", "no timeout", "open", "Reserved"]
     table = " ".join(f'{255 - k} "{word}"' for k, word in enumerate(words + fine))
     text = (START + fault + GOOD + f"VAL_ 801 T {table} ;\n").encode("cp1252")
     dev = device(tmp_path, text, [T], "{t: air_c}")
-    for raw in range(240, 256):
+    for raw in range(220, 256):
         status = read(dev, (801, bytes([0, 0, raw, 0, 0, 0, 0, 0]))).status[ROLE["air_c"]]
         assert status == (ERROR if raw > 255 - len(words) else OK), raw
+
+
+@pytest.mark.parametrize(
+    "line", ["801 Volts Absent ;", '801 Volts 65535.0 "SNA" ;', '801 Volts\n 65535 "SNA" ;']
+)
+@pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
+def test_words_that_cannot_be_read_leave_out_their_signal(tmp_path, line, fault):
+    """They were passed over, so that their 'SNA' was a reading."""
+    text = START + fault + GOOD + f"VAL_ {line}\n"
+    assert device(tmp_path, text, [T], "{t: air_c}")
+    if not fault and "\n" in line:  # cantools reads it
+        assert device(tmp_path, text, [V], "{v: voltage_v}")
+        return
+    with pytest.raises(InputError, match="VAL_ 801 Volts.*: no line of the format"):
+        device(tmp_path, text, [V], "{v: voltage_v}")
+
+
+@pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
+def test_words_without_their_semicolon_count(tmp_path, fault):
+    dev = device(tmp_path, START + fault + GOOD + 'VAL_ 801 Volts 65535 "SNA"\n', [V], "{v: voltage_v}")
+    assert read(dev, (801, bytes.fromhex("ffff000000000000"))).status[ROLE["voltage_v"]] == ERROR
+
+
+@pytest.mark.parametrize("value", ["99", '"StandardCAN_FD"'])
+def test_a_wrong_frame_format_is_passed_over(tmp_path, value):
+    """It was refused with 'list index out of range'."""
+    text = 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";\nBA_DEF_DEF_ "VFrameFormat" "StandardCAN";\n'
+    dev = device(
+        tmp_path, START + GOOD + text + f'BA_ "VFrameFormat" BO_ 801 {value};\n', [V], "{v: voltage_v}"
+    )
+    assert read(dev, (801, bytes.fromhex("d204000000000000"))).value[ROLE["voltage_v"]] == pytest.approx(
+        12.34
+    )
 
 
 @pytest.mark.parametrize("stated", [-32768, 32768])

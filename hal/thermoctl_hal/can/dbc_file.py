@@ -47,7 +47,11 @@ _LONG = re.compile(r'BA_\s+"System(?:Message|Signal)LongSymbol"\s+(?:BO_|SG_)\s+
 _KIND = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE)
 _PAGE = re.compile(r"m\d")
 _WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
-_WORDS = re.compile(r'\s*VAL_\s+(\d+)\s+\S+(?:\s+-?\d+\s+"[^"]*")+\s*;\s*')
+_WORDS = re.compile(r'\s*VAL_\s+(\d+)\s+\S+(?:\s+-?\d+\s+"(?:[^"\\]|\\.)*")*\s*;\s*')
+# Words of a signal without the semicolon at their end, which cantools passes over.
+_UNENDED = re.compile(
+    r'(?m)^(\s*VAL_\s+\d+\s+\S+(?:[ \t]+-?\d+[ \t]+"(?:[^"\\\n]|\\.)*")+)[ \t\r]*$(?!\s*[;\d-])'
+)
 _OF_A_MESSAGE = _TYPE, _EXTENDED_MUX, _FORMAT_OF, _WORDS
 _J1939 = re.compile(r'^\s*BA_\s+"ProtocolType"\s+"J1939', re.MULTILINE)
 _LINE = re.compile(r"at line (\d+)")
@@ -90,7 +94,7 @@ def load_dbc(path: Path) -> DbcFile:
     """Read a DBC file. Raises OSError; ValueError where no message can be read."""
     from cantools.database import load_string
 
-    text = read_text(path)
+    text = _UNENDED.sub(r"\1 ;", read_text(path))
     logging.getLogger("cantools").setLevel(logging.ERROR)  # cantools warns of names that are defined twice
     try:
         database: Any = load_string(text, database_format="dbc")
@@ -123,7 +127,10 @@ def _misread(text: str, database: Database) -> dict[str, str]:
                 why = "no multiplexer, or several, select its page: add SG_MUL_VAL_ lines"
                 faults.setdefault(f"{block.name}.{match['name']}", f"line {line}: {why}")
     read = {
-        f"{m.name}.{s.name}" for m in database.messages for s in m.signals if s.is_float or s.multiplexer_ids
+        f"{m.name}.{s.name}"
+        for m in database.messages
+        for s in m.signals
+        if s.is_float or s.multiplexer_ids or s.choices
     }
     unread = {name: why for name, why in faults.items() if name not in read}
     for m in database.messages:
@@ -231,8 +238,13 @@ def _blocks(text: str, faults: dict[str, str]) -> tuple[list[_Block], list[str],
 def _unread(
     number: int, line: str, blocks: list[_Block], faults: dict[str, str], remarks: list[tuple[int, str]]
 ) -> None:
-    """Leave out the signals that a line names whose kind or page it should state."""
-    words = set(re.findall(r"\w+", line)) if _KIND.match(line) else ()
+    """Leave out the signals that a line names whose kind, page or words it should state.
+
+    Words may say that a number is no reading."""
+    words = set(re.findall(r"\w+", line)) if _KIND.match(line) else set()
+    if of := _WORDS_OF.match(line):
+        words = {of[2]}
+        blocks = [b for b in blocks if b.number in (int(of[1]), int(of[1]) ^ EXTENDED)]
     for block in blocks:
         for _, text in block.lines:
             if (begin := _BEGINS_SIGNAL.match(text)) and begin[1] in words:
@@ -348,11 +360,13 @@ def _parsed(
     more = [" ".join(back.get(word, word) for word in m.split(" ")) for m in more]
     more = [m for m in more if m.startswith("BA_") or m.split()[2].rstrip(":") in back.values()]
     head = [f"BO_ {number} {name}: {block.length} Vector__XXX", *(s.text for s in signals), ""]
-    text = "\n".join(['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_:", "", *head, *attributes, *more, ""])
+    begin = ['VERSION ""', "", "NS_ :", "", "BS_:", "", "BU_:", "", *head]
+    text = "\n".join([*begin, *attributes, *more, ""])
+    without = "\n".join([*begin, *(m for m in more if not m.startswith("BA_")), ""])  # a wrong VFrameFormat
     why = ""
-    for strict in (True, False):
+    for content, strict in ((text, True), (text, False), (without, False)):
         try:
-            database: Any = load_string(text, database_format="dbc", strict=strict)
+            database: Any = load_string(content, database_format="dbc", strict=strict)
         except Exception as e:  # cantools raises parse errors of several libraries
             why = why or _first_line(e)
             continue

@@ -35,7 +35,10 @@ _NO_VALUE = re.compile(
     r"(?i)(SNA|(signal|value)?[ _]?(not[ _]?available|invalid)|no[ _](value|data|signal))[ _]*"
 )
 _NO_QUANTITY = re.compile(
-    r"(?i)(?<![^\W_])(SNA|not[ _]?avail|invalid|init|(?<!no[ _])(err|fault|fail|defect)|(un|in)g(ü|ue)ltig|fehler|no[ _](value|data|signal|sensor))"
+    r"(?i)(?<![^\W_])(SNA|n/?a(?![^\W_])|n\.a\.|(un|not[ _]?)avail|(in|not[ _]?)valid|init|undefined|unknown"
+    r"|(?<!no[ _])(err|fault|fail|defect|short[ _]?(circuit|to)|open[ _]?(circuit|wire|load)|broken|time[ _]?out|missing|lost"
+    r"|disconnect|out[ _]of[ _]range|(over|under)([ _]?flow|[ _]?range)|kurzschluss|bruch)|(im|un|not[ _]?)plausib"
+    r"|(un|in)g(ü|ue)ltig|fehler|nicht[ _](verf|vorh)|ersatzwert|substitut|(no|kein)[ _](value|data|signal|sensor|wert))"
 )
 # A value belongs to a raw number if it is this close to the number's value, in steps of the signal.
 NEAR_RAW = 0.01
