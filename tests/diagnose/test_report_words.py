@@ -95,8 +95,10 @@ def results(draw):
         for k in keys
     }
     stays = verdict not in ("consistent", "explained") or law
+    times = draw(st.lists(st.just([10.0, 20.0]), max_size=4))
     return {
         "verdict": verdict,
+        "mismatch": [{"channel": o, "recording": "run_1", "when": times} for o in names],
         "findings": findings,
         "alternatives": draw(st.lists(effects(doubted=True), max_size=4)),
         "remainder": {
@@ -155,6 +157,10 @@ def test_a_remainder_has_a_size_and_its_measure_beside_it(found):
         assert ("and steps of" in text) is (rows[output].left < rows[output].step)
     if "no larger than its noise" in text:
         assert all((o.over_noise or 0) <= 1 for o in rows.values()) and found["decision"]["remains"] >= 0.5
+    if "most of it is in run_1 from 10 to 20 s" in text:
+        assert found["verdict"] == "unexplained" and 1 <= len(found["mismatch"][0]["when"]) <= 2
+    elif found["verdict"] == "unexplained" and " enters at " in text:
+        assert len(found["mismatch"][0]["when"]) not in (1, 2)
     if found["verdict"] in ("explained", "consistent"):
         assert "remains" not in text and "Something is missing" not in text
     if "A small systematic error" in text:

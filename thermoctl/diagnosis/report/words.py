@@ -34,6 +34,7 @@ RATHER = 0.5  # least probability of an alternative that is mentioned where noth
 # diagnoses with findings the largest was 1.07.
 CLEARLY = 1.5
 LARGER = 1.1  # least error over the noise that is stated with the verdict `consistent`
+FEW = 2  # largest number of intervals of time that are told
 NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 
 
@@ -246,4 +247,9 @@ def _remainder(result: Result, rows: Sequence[Output]) -> str:
             return ""
         text = f"What remains of {o.name} is no larger than its noise of {noise}, but not random"
     text += f"; it enters at {r['node']}" if r["node"] else ""
-    return text + (f" and follows {listed(list(r['follows']))}." if r["follows"] else ".")
+    text += f" and follows {listed(list(r['follows']))}" if r["follows"] else ""
+    m = next((m for m in result.get("mismatch", ()) if m["channel"] == o.name), None)
+    if m and result["verdict"] == "unexplained" and 0 < len(m["when"]) <= FEW:
+        times = listed([f"{a:.6g} to {b:.6g} s" for a, b in m["when"]])
+        text += f"; most of it is in {m['recording']} from {times}"
+    return text + "."
