@@ -72,7 +72,9 @@ def test_a_lag_is_found_where_a_refit_without_it_gives_the_member_hardly_any_exp
     rng, t = np.random.default_rng(1), np.arange(400) * 5.0
     power = np.repeat(rng.choice([0.0, 2.0, 4.0, 6.0], 7), 60)[:400]
     inputs = {"power": power, "air": 22 + 0.3 * np.sin(t / 3000)}
-    run = measured(LAGGED.replace("first(bobbin_t)", "22").replace("first(shaft_t)", "22"), inputs, t, TRUE, 1)
+    run = measured(
+        LAGGED.replace("first(bobbin_t)", "22").replace("first(shaft_t)", "22"), inputs, t, TRUE, 1
+    )
     result = contract(diagnose(loads(MEMBERS), [run], catalogue(), limits()))
     (found,) = result["findings"]
     assert (result["verdict"], found["effect"], found["where"]) == ("explained", "expansion_lag", "error")

@@ -68,7 +68,11 @@ def test_a_wrong_fixed_number_is_named_as_such(name, factor, effect):
 def test_a_fixed_heat_and_a_fixed_storage_that_fit_alike_are_both_told():
     """With all conductances free, only heat over storage is seen: the storage alone had 0.97."""
     plant, bare = rig(BLOCK)
-    text = PLANTS[BLOCK].replace("parameters:", "parameters:\n  P: {value: 1}").replace("rate: heat,", "rate: P * heat,")
+    text = (
+        PLANTS[BLOCK]
+        .replace("parameters:", "parameters:\n  P: {value: 1}")
+        .replace("rate: heat,", "rate: P * heat,")
+    )
     true = fixed(loads(text), "C")
     table = compile_plant(true).measure(bare, 3)
     found = contract(diagnose(fixed(true, "P", 0.85), [table], catalogue((CATALOGUE,)), limits()))

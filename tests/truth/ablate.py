@@ -179,6 +179,16 @@ RULES: Mapping[str, Rule] = {
     "mistakes": Rule(
         "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True
     ),
+    "file's values": Rule(
+        "parts of the best that are far from the plant file's values are extended from these, too",
+        {"search.beam.afresh": lambda s: None},
+        searches=True,
+    ),
+    "law's values": Rule(
+        "what stands beside a leading law is extended from the law's refit",
+        {"law.contest._as_known": lambda s: None},
+        searches=True,
+    ),
     "observer": Rule(
         "a rig that drifts is searched with an observer, too",
         {"search.beam.with_observer": _no},

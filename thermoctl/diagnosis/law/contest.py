@@ -17,6 +17,7 @@ from thermoctl.diagnosis.evidence.fit import Fitted, Placed, placed_at
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
 from thermoctl.diagnosis.hypothesis.candidates import Keys
+from thermoctl.diagnosis.hypothesis.places import Place
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.free import pays
@@ -84,8 +85,12 @@ def _replaced(w: Weighed, law: PlacedLaw, other: Weighed) -> bool:
     new = [e for e in other.fitted.hypothesis.effects if e.key not in keys]
     if len(new) != 1 or isinstance(new[0], PlacedLaw) or keys - other.fitted.hypothesis.keys != {law.key}:
         return False
-    place, flows = new[0].candidate.place, other.fitted.plant.flows
-    flow = flows.get(place.flow or "")
+    return _shares_nodes(law, new[0].candidate.place, other.fitted)
+
+
+def _shares_nodes(law: PlacedLaw, place: Place, f: Fitted) -> bool:
+    """Return whether a place of a hypothesis has one of a law's nodes, or its reading."""
+    flow = f.plant.flows.get(place.flow or "")
     ends = {flow.source, flow.target} if flow else set()
     own = law.proposal.place
     return not {*own.nodes, own.target}.isdisjoint({*place.nodes.values(), *ends, place.output})
@@ -127,17 +132,19 @@ def _compete(s: Search, laws: Sequence[Weighed], done: int) -> None:
 
 
 def _as_known(s: Search) -> None:
-    """Extend what stands beside the leading law by effects, from the law's refit.
+    """Extend what stands beside the leading law by effects at its nodes, from the law's refit.
 
     There an effect may be found that is the law, and whose own refit ended in a wrong optimum."""
     best = s.best.fitted
-    if not laws_of(best) or s.case.budget.stopped():
+    laws = laws_of(best)
+    if not laws or s.case.budget.stopped():
         return
     base = _beside(s, [e for e in best.hypothesis.effects if not isinstance(e, PlacedLaw)], best)
     if base:
         values = {q: p.value for q, p in best.plant.parameters.items()}
         try:
-            s.extended(replace(base, fitted=placed_at(s.case, base.fitted, values)), True)
+            there = replace(base, fitted=placed_at(s.case, base.fitted, values))
+            s.extended(there, lambda place: any(_shares_nodes(law, place, best) for law in laws))
         except FAILS:
             return
         if s.best.fitted is not best:

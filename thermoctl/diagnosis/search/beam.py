@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +26,7 @@ from thermoctl.diagnosis.evidence.odds import odds
 from thermoctl.diagnosis.evidence.posterior import BELIEF
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys, candidates, found_again
 from thermoctl.diagnosis.hypothesis.effect import Effect
+from thermoctl.diagnosis.hypothesis.places import Place
 from thermoctl.diagnosis.search.again import Known
 from thermoctl.diagnosis.search.gains import Direction
 from thermoctl.diagnosis.search.mistakes import mistakes
@@ -122,10 +123,10 @@ class Search:
                     odds = min(w.log_odds, simpler.score - w.fitted.log_evidence)
                     self.tried[keys] = Weighed(w.fitted, odds)
 
-    def extended(self, parent: Weighed, again: bool = False) -> list[Weighed]:
+    def extended(self, parent: Weighed, again: Callable[[Place], bool] | None = None) -> list[Weighed]:
         """Extend a hypothesis, once; by nothing where its plant has no responses.
 
-        `again`: from other values of its parameters, with effects whose refit may have ended elsewhere."""
+        `again`: from other values of its parameters, with effects at these places that it has not yet."""
         if parent.fitted.hypothesis.keys in self.seen and not again:
             return []
         if self.case.budget.spent:
@@ -139,9 +140,12 @@ class Search:
             return []
         if not parent.fitted.hypothesis.effects:
             self.norms = looked.norms
+        if again:  # the error that is left there is no guide: only first-order steps are
+            there = [(d, gain) for d, gain in looked.promised if again(d.candidate.place)]
+            looked = dataclasses.replace(looked, promised=there, energy=None, by_energy=[])
         for d, gain in looked.promised:
             self.promised[d.candidate.key] = max(gain, self.promised.get(d.candidate.key, 0.0))
-        found = extensions(self, parent, looked, again)
+        found = extensions(self, parent, looked, again is not None)
         self.keep(found)
         return found
 
@@ -247,8 +251,8 @@ def swap(s: Search) -> None:
 def afresh(s: Search) -> None:
     """Extend parts of the best hypothesis that are far from the plant file's values from these.
 
-    Without an effect a refit may move a parameter to where the effect changes nothing, and hides it: the lag
-    of a member whose expansion is nearly none. Where the best hypothesis is near these values, it is right
+    Without an effect a refit may move a parameter to where the effect changes nothing. So the lag of a member
+    is hidden whose expansion is nearly none. Where the best hypothesis is near these values, it is right
     against a part that is far less likely."""
     best, own = s.best, s.case.plant.parameters
     scales = {q: Scale(p) for q, p in own.items() if p.range}
@@ -258,16 +262,17 @@ def afresh(s: Search) -> None:
         there = f.rough_plant.parameters
         return any(abs(x.z(there[q].value) - x.z(own[q].value)) > BELIEF for q, x in scales.items())
 
-    parts = [w for keys, w in s.tried.items() if keys < best.fitted.hypothesis.keys or w is best and not keys]
+    parts = [w for keys, w in s.tried.items() if keys < best.fitted.hypothesis.keys]
     least = -np.inf if far(best.fitted) else best.score - HOPELESS
     for w in (w for w in parts if w.score > least and far(w.fitted)):
         try:
             there = placed_at(s.case, w.fitted, {q: p.value for q, p in own.items()})
         except FAILS:
             continue
-        s.extended(dataclasses.replace(w, fitted=there), True)
-    if s.best is not best:
-        swap(s)
+        s.extended(dataclasses.replace(w, fitted=there), lambda place: True)
+        if s.best is not best:
+            swap(s)
+            return
 
 
 def simplified(s: Search) -> list[Weighed]:
@@ -448,13 +453,14 @@ def extensions(s: Search, parent: Weighed, looked: Screened, again: bool = False
     """Refit the parent with each direction, and with each pair of directions, of the shortlist.
 
     An extension is left out if twice its predicted gain does not bring it to the leader. Every prediction is
-    multiplied by the largest ratio so far of a refit's gain to its prediction."""
+    multiplied by the largest ratio so far of a refit's gain to its prediction. `again`: those that were
+    refused are tried, too, whatever they promise."""
     case, limits, tried = s.case, s.case.limits, s.tried
     out: list[Weighed] = []
     # beside effects that leave only noise, two more would imitate a small misfit
     misfit = not parent.fitted.hypothesis.effects or not only_noise(case, parent.fitted)
-    queue, ratio = shortlist(looked, s.price, limits.shortlist, paired=misfit), 1.0
-    known = set[Keys]() if again else tried.keys() | s.refused.keys()
+    queue, ratio = shortlist(looked, s.price, limits.shortlist, paired=misfit and not again), 1.0
+    known = {*tried} if again else tried.keys() | s.refused.keys()
     new = s.best.fitted.hypothesis.keys - parent.fitted.hypothesis.keys
     queue += elsewhere(new, s.best.score - parent.score, looked, queue)
 
@@ -464,7 +470,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened, again: bool = False
         keys = parent.fitted.hypothesis.keys | {d.candidate.key for d in added}
         if keys in known or len(keys) > limits.effects:
             return False
-        if parent.score + HALF * ratio * gain < max(w.score for w in [*tried.values(), *out]):
+        if not again and parent.score + HALF * ratio * gain < max(w.score for w in [*tried.values(), *out]):
             return False
         case.budget.untried += case.budget.spent
         if case.budget.spent:
