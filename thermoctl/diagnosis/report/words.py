@@ -34,7 +34,7 @@ RATHER = 0.5  # least probability of an alternative that is mentioned where noth
 # diagnoses with findings the largest was 1.07.
 CLEARLY = 1.5
 LARGER = 1.1  # least error over the noise that is stated with the verdict `consistent`
-FEW = 2  # largest number of intervals of time that are told
+FEW = 2  # largest number of intervals of time that are listed
 NOT_RANDOM = 0.5  # least probability of a remainder, smaller than the noise, that is mentioned
 
 
