@@ -22,7 +22,9 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thres
         c = e.candidate
         share = max(len(where), 1) * len(where.get(c.effect.name, {c.place.where})) * c.clocks
         total += np.log(limits.missing / (1 - limits.missing) / share)
-        total += rare(c.effect, bool(c.place.input)) * np.log(limits.rare)
+        # a derivative of a reading, which undoes its lag, follows almost anything
+        undone = any("recorded" in change for change in c.effect.changes[c.variant])
+        total += (rare(c.effect, bool(c.place.input)) + undone) * np.log(limits.rare)
     return float(total)
 
 

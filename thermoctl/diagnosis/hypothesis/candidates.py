@@ -61,12 +61,14 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
             continue
         clocks = _clocks(rig, effect)
         for place, here in _placed(rig, effect):
-            for variant in range(len(effect.changes)):
+            for variant, changes in enumerate(effect.changes):
+                if any("recorded" in c for c in changes) and not place.input:
+                    continue
                 for k, choice in enumerate(_choices(rig, effect, place)):
                     for which, begins in clocks.items():
                         label = f"{variant}{k}{which}"
                         candidate = Candidate(here, place, rig, variant, choice, label, begins, len(clocks))
-                        if not candidate.jumps and any("straight" in c for c in effect.changes[variant]):
+                        if not candidate.jumps and any("straight" in c for c in changes):
                             continue  # without a held input it would equal the variant without `straight`
                         out.append(candidate)
     return out

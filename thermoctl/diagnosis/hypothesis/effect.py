@@ -321,16 +321,16 @@ def _changes(changes: Sequence[Node], symbols: set[str], parameters: set[str], w
             _expression(node, {*symbols, *made, *({OWN[kind]} if kind in OWN else ())}, kind)
         elif kind in PARTS:
             _part(kind, node, {*symbols, *made}, made, parameters, where)
-        elif kind == "straight":
+        elif kind in ("straight", "recorded"):
             if node.value not in symbols:
-                raise node.error(f"straight: a symbol was expected, one of {', '.join(sorted(symbols))}")
+                raise node.error(f"{kind}: a symbol was expected, one of {', '.join(sorted(symbols))}")
         elif kind == "exponent":
             if node.value not in parameters:
                 raise node.error(
                     f"exponent: a parameter was expected, one of {', '.join(sorted(parameters))}"
                 )
         else:
-            kinds = (*FORMS, *PARTS, "straight", "exponent")
+            kinds = (*FORMS, *PARTS, "straight", "recorded", "exponent")
             raise node.error(
                 f"'{kind}' is not a change{suggest(kind, kinds)}; one of {', '.join(kinds)} was expected"
             )
