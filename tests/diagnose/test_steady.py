@@ -56,10 +56,14 @@ def run(plant: str, seed: int, scatter: float) -> Table:
     return table
 
 
-@pytest.mark.parametrize(("plant", "scatter"), [(ELEVATOR, 0.09), (ELEVATOR, 0.0), (SLEDGE, 0.09)])
-def test_noise_of_an_inputs_reading_is_no_missing_physics(plant, scatter):
-    """Dead zones, friction and laws with their edges at the levels were named, 0.91 and above 0.99."""
-    recordings = [run(plant, 1, scatter), run(plant, 2, scatter)]
+@pytest.mark.parametrize(
+    ("plant", "scatter", "runs"), [(ELEVATOR, 0.09, 3), (ELEVATOR, 0.0, 2), (SLEDGE, 0.09, 2)]
+)
+def test_noise_of_an_inputs_reading_is_no_missing_physics(plant, scatter, runs):
+    """Dead zones, friction and laws with their edges at the levels were named, 0.91 and above 0.99.
+
+    Of three recordings one is set aside: it ended the diagnosis."""
+    recordings = [run(plant, seed, scatter) for seed in range(1, runs + 1)]
     result = contract(diagnose(loads(plant), recordings, catalogue(), limits()))
     assert (result["verdict"], result["findings"]) == ("consistent", [])
     assert any("readings of current scatter" in note for note in result["notes"]) == bool(scatter)

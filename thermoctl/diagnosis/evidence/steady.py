@@ -1,16 +1,19 @@
-"""Inputs that are driven in levels, whose readings scatter about them.
+"""Inputs whose readings scatter about what drives the plant: levels, or a smooth course.
 
 A simulation is driven by readings: a mass integrates the noise of a current's reading. A function of the
 reading that is flat at each level takes this noise away, and predicts every part better. A limit, a dead zone
 and a law with its edges at the levels do so. So the mean of each level is tried as the input. The mean has an
-error, too: it is fitted to the outputs, with its own standard error as the prior."""
+error, too: it is fitted to the outputs, with its own standard error as the prior. An input on straight lines
+is smoothed by Gaussians of growing width. Otherwise a lag and an advance together would smooth it, or an
+advance by a part of a row."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.between import CLEARLY, alone
@@ -26,7 +29,9 @@ SAME = 4.0  # standard errors of a difference of two means below which they are 
 # Least ratio of von Neumann (1941), 2 for white noise: below it, the input moves within its levels. In 120
 # recordings of rigs and generated cases no moving input has more than 1.04.
 WHITE = 1.5
-FARTHEST = 3.0  # standard errors by which a fit moves a level at most
+FARTHEST = 3.0  # standard errors by which a fitted level is from its mean at most
+WIDTHS = (2.0, 8.0, 32.0)  # standard deviations of a smoothing Gaussian, in rows
+SCATTER = "scatter about"
 ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
 
 
@@ -34,48 +39,85 @@ ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
 class Levels:
     """The levels of an input: by recording the number of the level in each row (N,), -1 for none.
 
-    `values`, `sd` (levels,): their means and standard errors."""
+    `values`, `means`, `sd` (levels,): as fitted, the means of their readings, and the standard errors."""
 
     of: list[np.ndarray]
     values: np.ndarray
+    means: np.ndarray
     sd: np.ndarray
 
     def read(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return readings (N,) by recording with each level in place of those at it."""
-        return [np.where(k >= 0, self.values[k], x) for k, x in zip(self.of, columns, strict=True)]
+        """Return readings (N,) of the first recordings with each level in place of those at it."""
+        return [np.where(k >= 0, self.values[k], x) for k, x in zip(self.of, columns, strict=False)]
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """The course of an input by recording (N,), smoothed."""
+
+    course: list[np.ndarray]
+
+    def read(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the courses of the first recordings."""
+        return self.course[: len(columns)]
 
 
 def steady(
     case: Case, made: Callable[[Sequence[Table]], Case], tables: Sequence[Table], reserve: Sequence[Table]
 ) -> tuple[Case, list[Table]]:
-    """Return the case and the recordings set aside, with levels as inputs or as they are.
+    """Return the case and the recordings set aside, with inputs without their scatter or as they are.
 
-    Levels are taken where the plant alone fits clearly better with them. `made`: makes the case of
-    recordings. Raises InputError."""
+    Levels, and then smooth courses, are taken where the plant alone fits clearly better with them. `made`:
+    makes the case of recordings. Raises InputError."""
     given, n = [*tables, *reserve], len(tables)
+    for what, kind in () if case.memory.recordings else (("levels", _levels), ("a smooth course", _courses)):
+        start: float | None = None
+        best, least = (case, given, ""), 0.0
+        try:
+            for found in kind(case, made, given, n):
+                start = alone(case) if start is None else start
+                least = max(least, start + CLEARLY)
+                driven = _driven(given, found)
+                other = made(driven[:n])
+                if (height := alone(other)) <= least:
+                    break
+                best, least = (other, driven, ", ".join(found)), height
+        except (InputError, SimulationError, np.linalg.LinAlgError):
+            pass
+        if best[2] and start is not None:
+            notes = [note for note in case.notes if SCATTER in note]
+            case, given, columns = best
+            case.notes.extend(notes)
+            case.notes.append(
+                f"the readings of {columns} {SCATTER} {what}; with it the plant alone follows the recordings better "
+                f"({least - start:.0f} nats): taken so"
+            )
+    return case, given[n:]
+
+
+def _levels(
+    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int
+) -> Iterator[dict[str, Levels]]:
+    """Yield the levels of inputs, fitted to the first n recordings. Raises InputError, SimulationError."""
     columns = {i.column for i in case.plant.inputs.values()}
     found = {c: v for c in sorted(columns) if (v := levels([t.columns[c] for t in given]))}
-    if not found or case.memory.recordings:
-        return case, list(reserve)
-    try:
-        for _ in range(ROUNDS):
-            other = made(_driven(given, found)[:n])
-            found = _fitted(other, given[:n], found)
-        again = _driven(given, found)
-        other = made(again[:n])
-        gain = alone(other) - alone(case)
-    except (InputError, SimulationError, np.linalg.LinAlgError):
-        return case, list(reserve)
-    if gain <= CLEARLY:
-        return case, list(reserve)
-    other.notes.append(
-        f"the readings of {', '.join(found)} scatter about levels; with these levels the plant alone follows the recordings "
-        f"better ({gain:.0f} nats): taken so"
-    )
-    return other, again[n:]
+    for _ in range(ROUNDS if found else 0):
+        found = _fitted(made(_driven(given, found)[:n]), given[:n], found)
+    if found:
+        yield found
 
 
-def _driven(tables: Sequence[Table], found: Mapping[str, Levels]) -> list[Table]:
+def _courses(
+    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int
+) -> Iterator[dict[str, Smooth]]:
+    """Yield the courses of inputs that are read on straight lines, smoother and smoother."""
+    columns = sorted({i.column for i in case.plant.inputs.values() if i.linear})
+    moving = [c for c in columns if all(np.ptp(t.columns[c]) > 0 for t in given)]  # no cell is lost, too
+    for width in WIDTHS if moving else ():
+        yield {c: Smooth([gaussian_filter1d(t.columns[c], width) for t in given]) for c in moving}
+
+
+def _driven(tables: Sequence[Table], found: Mapping[str, Levels | Smooth]) -> list[Table]:
     read = {c: v.read([t.columns[c] for t in tables]) for c, v in found.items()}
     return [
         replace(t, columns={**t.columns, **{c: v[k] for c, v in read.items()}}) for k, t in enumerate(tables)
@@ -110,11 +152,15 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
         parts.append(-part.reshape(-1, part.shape[2]))
     slopes = np.hstack([np.stack(changed, axis=1), np.concatenate(parts)])
     misfit = max(float(np.mean(now**2)), 1.0)  # missing physics must not move a level
-    step = np.linalg.solve(slopes.T @ slopes + misfit * np.eye(slopes.shape[1]), -slopes.T @ now)
-    steps = np.split(step, np.cumsum([len(v.sd) for v in found.values()]))
+    off = np.concatenate(
+        [*((v.values - v.means) / v.sd for v in found.values()), np.zeros(parts[0].shape[1])]
+    )
+    total = slopes.T @ slopes + misfit * np.eye(len(off))
+    off += np.linalg.solve(total, -slopes.T @ now - misfit * off)
+    ends = np.cumsum([len(v.sd) for v in found.values()])
     return {
-        c: replace(v, values=v.values + v.sd * np.clip(own, -FARTHEST, FARTHEST))
-        for (c, v), own in zip(found.items(), steps, strict=False)
+        c: replace(v, values=v.means + v.sd * np.clip(own, -FARTHEST, FARTHEST))
+        for (c, v), own in zip(found.items(), np.split(off, ends), strict=False)
     }
 
 
@@ -146,4 +192,4 @@ def levels(columns: Sequence[np.ndarray]) -> Levels | None:
         k = int(np.argmin(np.abs(values - x[p].mean())))
         if len(p) >= LEVEL or abs(values[k] - x[p].mean()) < SAME * noise / np.sqrt(len(p)):
             of[p] = k
-    return Levels(np.split(of, first), values, noise / np.sqrt([len(p) for p in groups]))
+    return Levels(np.split(of, first), values, values, noise / np.sqrt([len(p) for p in groups]))
