@@ -224,11 +224,6 @@ RULES: Mapping[str, Rule] = {
         {"search.beam.NEAR": float("inf")},
         searches=True,
     ),
-    "far": Rule(
-        "a law depends on no node that acts only through two others",
-        {"law.signals._far": _nothing},
-        searches=True,
-    ),
     "reading": Rule(
         "a law depends on no unread column that follows a node or an output",
         {"law.signals._follows": _no},

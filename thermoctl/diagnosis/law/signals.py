@@ -14,7 +14,6 @@ from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.language import Flow, Plant
 from thermoctl.units import conversion, dimension
 
-BESIDE = 2  # largest number of links from a place to a node on which a law there may depend
 FOLLOWS = 0.9  # share of a column's variance that a node or an output shows, above which it may be a reading
 ALIKE = 1 - 1e-6  # correlation about zero from which two signals are one
 HOME = 0.1  # share of a position's range up to which its zero is near
@@ -186,7 +185,6 @@ def _factor(plant: Plant, a: Expr, b: Expr) -> Expr | None:
 def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
     """Return the signals that a law at a place may depend on, each with its typical size over the runs.
 
-    A node that is linked to the place only through two or more others is no signal: it acts through these.
     The error of a reading depends on what is read. A storage depends on states, not on inputs."""
     p, out = rig.physics, []
     if place.part == "reading":
@@ -198,8 +196,7 @@ def signals(rig: Rig, place: Place, runs: Sequence[Values]) -> list[Signal]:
         out += [_between(rig, place, n, i) for i in _beside(rig, n)]
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
     out += _across(rig, place)
-    far = _far(p, place)
-    for n in (n for n in p.nodes if n not in near and n not in far):
+    for n in (n for n in p.nodes if n not in near):
         out.append(_absolute(rig, place, n, p.nodes[n].unit))
         linked = any({n, place.target} == {f.source, f.target} for f in p.flows.values())
         if linked and not place.source and p.nodes[n].unit == p.nodes[place.target].unit:
@@ -256,15 +253,6 @@ def _beside(rig: Rig, n: str) -> list[str]:
     exchanged = {i for read in rates if n in read for i in read & {*rig.heat_inputs}}
     moving = rig.moving_inputs & {*rig.heat_inputs}
     return sorted(moving | exchanged | ({rig.air} if rig.air else set()), key=lambda i: (i != rig.air, i))
-
-
-def _far(p: Plant, place: Place) -> set[str]:
-    """Return the nodes that flows link to a place only through two or more other nodes."""
-    links = [{f.source or "", f.target or "", *ex.names(f.rate)} & p.nodes.keys() for f in p.flows.values()]
-    rounds = [set(place.nodes)]
-    for _ in range(max(len(p.nodes), BESIDE)):
-        rounds.append(rounds[-1].union(*(link for link in links if link & rounds[-1])))
-    return rounds[-1] - rounds[BESIDE]
 
 
 def _absolute(rig: Rig, place: Place, n: str, unit: str | None) -> Signal:
