@@ -138,7 +138,7 @@ def test_a_search_that_is_stopped_knows_that_something_was_left_out(monkeypatch,
     """Stopped between two rounds, or before rivals were tried, a gain of a sensor was named at 1.0 (a cylinder)."""
     order: list[Weighed] = []
 
-    def extensions(s, parent, looked):
+    def extensions(s, parent, looked, again):
         """Return the known extensions of a hypothesis."""
         order.append(parent)
         known = TREE.get("".join(sorted(name for name, _ in parent.fitted.hypothesis.keys)), {})

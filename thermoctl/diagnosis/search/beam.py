@@ -138,7 +138,7 @@ class Search:
             looked = screened(self.case, parent.fitted, self.known)
         except FAILS:
             return []
-        if not parent.fitted.hypothesis.effects:
+        if not parent.fitted.hypothesis.effects and not again:
             self.norms = looked.norms
         if again:  # the error that is left there is no guide: only first-order steps are
             there = [(d, gain) for d, gain in looked.promised if again(d.candidate.place)]
@@ -454,7 +454,7 @@ def extensions(s: Search, parent: Weighed, looked: Screened, again: bool = False
 
     An extension is left out if twice its predicted gain does not bring it to the leader. Every prediction is
     multiplied by the largest ratio so far of a refit's gain to its prediction. `again`: those that were
-    refused are tried, too, whatever they promise."""
+    refused are tried, too, at any promise."""
     case, limits, tried = s.case, s.case.limits, s.tried
     out: list[Weighed] = []
     # beside effects that leave only noise, two more would imitate a small misfit
