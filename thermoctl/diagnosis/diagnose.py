@@ -25,7 +25,7 @@ from thermoctl.diagnosis.law.forms import LAW
 from thermoctl.diagnosis.law.smooth import missing_flow
 from thermoctl.diagnosis.limits import Thresholds
 from thermoctl.diagnosis.result import Diagnosis
-from thermoctl.diagnosis.search.beam import Searched, Weighed, search, searched
+from thermoctl.diagnosis.search.beam import Searched, Weighed, afresh, search, searched
 from thermoctl.diagnosis.threads import one_thread
 from thermoctl.diagnosis.verdict.coloured import coloured
 from thermoctl.diagnosis.verdict.confirm import Confirm, brief, confirmed, timed
@@ -114,8 +114,9 @@ def sought(
 
     known, reserve = steady(made(chosen_on), made, chosen_on, reserve)
     known.notes.extend([*hung, *notes, *more])
-    found = searched(with_laws(search(known)))
-    return Sought(known, found, tuple(reserve), stopped() and bool(known.budget.untried))
+    tried = with_laws(search(known))
+    afresh(tried)
+    return Sought(known, searched(tried), tuple(reserve), stopped() and bool(known.budget.untried))
 
 
 def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:

@@ -71,7 +71,7 @@ KEPT = 20  # number of values of the shapes of a form over a signal that are kep
 class Proposal:
     """Terms at a place, their sizes, and the gain in log likelihood that the linearised plant predicts.
 
-    `start`: of a law that was refitted, the values of the plant's parameters there."""
+    `start`: of a part of a refitted law, the values of the plant's parameters there."""
 
     place: Place
     terms: tuple[Term, ...]

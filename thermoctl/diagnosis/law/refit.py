@@ -131,14 +131,13 @@ def _start(p: Proposal) -> tuple[dict[str, float], dict[str, tuple[float, float]
 
 
 def settled(law: PlacedLaw, f: Fitted) -> Proposal:
-    """Return a refitted law at the values of the refit, those of the plant's own parameters, too."""
+    """Return a refitted law at the values of the refit."""
     p, terms, sizes = law.proposal, list[Term](), list[float]()
     for k, t in enumerate(p.terms, 1):
         values = {q: f.plant.parameters[law.own[f"{q}{k}"]].value for q in (*t.form.sizes, *t.form.shapes)}
         terms.append(dataclasses.replace(t, shapes={q: values[q] for q in t.form.shapes}))
         sizes += [values[q] for q in t.form.sizes]
-    values = {q: v.value for q, v in f.plant.parameters.items()}
-    return dataclasses.replace(p, terms=tuple(terms), sizes=tuple(sizes), start=values)
+    return dataclasses.replace(p, terms=tuple(terms), sizes=tuple(sizes))
 
 
 def limit_of(law: PlacedLaw, f: Fitted) -> Proposal:
@@ -169,7 +168,9 @@ def _likest(term: Term, sizes: Sequence[float], form: Form) -> tuple[Term, tuple
 
 
 def simpler_law(law: PlacedLaw, f: Fitted) -> Proposal:
-    """Return a refitted law without its least significant term, at the values of the refit."""
+    """Return a refitted law without its least significant term, at the values of the refit.
+
+    The plant's parameters start there, too."""
     p = settled(law, f)
     named = [[law.own[f"{q}{k}"] for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
     sizes = np.split(np.array(p.sizes), np.cumsum([len(own) for own in named])[:-1])
@@ -179,7 +180,8 @@ def simpler_law(law: PlacedLaw, f: Fitted) -> Proposal:
     ]
     kept = [k for k in range(len(p.terms)) if k != int(np.argmin(sure))]
     left = tuple(float(v) for k in kept for v in sizes[k])
-    return dataclasses.replace(p, terms=tuple(p.terms[k] for k in kept), sizes=left)
+    start = {q: v.value for q, v in f.plant.parameters.items()}
+    return dataclasses.replace(p, terms=tuple(p.terms[k] for k in kept), sizes=left, start=start)
 
 
 def affordable(case: Case, parent: Fitted) -> int:

@@ -174,7 +174,6 @@ def search(case: Case) -> Search:
     if with_observer(s):
         grow(s)
         swap(s)
-    afresh(s)
     s.admit()
     return s
 
@@ -272,6 +271,7 @@ def afresh(s: Search) -> None:
         s.extended(dataclasses.replace(w, fitted=there), lambda place: True)
         if s.best is not best:
             swap(s)
+            s.admit()
             return
 
 
