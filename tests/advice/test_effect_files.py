@@ -33,7 +33,7 @@ def rows(title):
 def test_the_page_lists_what_the_reader_knows():
     assert {r[0][0]: tuple(r[2]) for r in rows("Places") if r[0] != ["where"]} == dict(SYMBOLS)
     assert set(SYMBOLS) == set(PLACES)
-    assert {r[0][0] for r in rows("Changes")} == {*FORMS, *PARTS, "exponent", "straight"}
+    assert {r[0][0] for r in rows("Changes")} == {*FORMS, *PARTS, "exponent", "straight", "recorded"}
     told = {kind: r[1] for r in rows("Shapes") for kind in r[0]}
     assert set(told) == set(SHAPES)
     assert all(set(SHAPES[kind]) <= set(names) for kind, names in told.items())

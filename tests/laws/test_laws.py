@@ -12,7 +12,6 @@ import pytest
 import yaml
 from scipy.integrate import solve_ivp
 
-from tests.bench.scale import block_plant
 from tests.laws.prove import EQUAL, cases, difference
 from tests.laws.real import law_of
 from tests.laws.rigs import LAWS, RELAYS, STORAGES, TANKS, make
@@ -852,17 +851,6 @@ def test_the_time_of_day_is_a_signal_where_each_hour_was_visited():
 def _named(table, count):
     rows = {k: v[:count] for k, v in table.columns.items()}
     return {"t": table.t[:count], **dict.fromkeys(("one", "two", "air"), np.arange(count)), **rows}
-
-
-@pytest.mark.parametrize("linked", [True, False])
-def test_a_law_depends_on_no_node_that_acts_through_two_others(linked):
-    links = [(1, 2), (2, 3), (3, 4), (4, 5)][: None if linked else 2]
-    plant, t = loads(block_plant(5, links)), np.arange(50.0)
-    runs = [{"t": t} | {n: 20 + k * t for k, n in enumerate((*plant.nodes, *plant.inputs), 1)}]
-    rig = Rig(plant, [compile_plant(plant).excitation(Table("run", "", t, runs[0]))], runs)
-    labels = {s.label for s in signals(rig, Place("block_1"), runs)}
-    assert {"block_1", "block_1 - block_2", "block_3", "heat_1"} <= labels
-    assert ("block_4" in labels, "block_5" in labels) == (not linked, not linked)
 
 
 def test_friction_that_grows_with_the_load_is_not_taken_for_dry_friction_that_leaves_only_noise():

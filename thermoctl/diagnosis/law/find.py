@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from thermoctl.diagnosis.data.case import Case
-from thermoctl.diagnosis.evidence.fit import Fitted
+from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
 from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.law.free import PIECES, SPREAD, pieces
 from thermoctl.diagnosis.law.propose import Proposal
@@ -17,6 +17,7 @@ from thermoctl.diagnosis.law.refit import (
     SIMPLER,
     PlacedLaw,
     affordable,
+    apart,
     at_bound,
     law_rate,
     laws_of,
@@ -149,12 +150,11 @@ def refits(
 ) -> list[tuple[Proposal, Fitted]]:
     """Refit the proposals that may beat the best law so far, and return the refits that end at no bound.
 
-    From the best sum, and from one with an insignificant term, the least significant term is left out. A law
-    of these terms that is less likely may have ended in a wrong optimum: it is refitted from there. A term
+    From the best sum, and from one with an insignificant term, the least significant term is left out. A term
     whose shape is at its upper bound gets the form that it becomes there.
     All promises are multiplied by the largest ratio so far of a refit's gain to its promise. Beside a best
     hypothesis that leaves only noise, this ratio is trusted after SURE refits, even if it is below one."""
-    tried, scores = list[tuple[Proposal, Fitted]](), dict[object, float]()
+    tried = list[tuple[Proposal, Fitted]]()
     queue, more = list(proposals), SIMPLER
     ratios = list[float]()
     leader, left, ahead = parent, affordable(case, parent), max(goal.least[0], 0.0)
@@ -181,13 +181,31 @@ def refits(
             leader = max(leader, f, key=lambda x: x.log_likelihood)
             if not at_bound(f):
                 tried.append((p, f))
-            score = more_evidence - p.cost
-            scores[p.kind] = max(score, scores.get(p.kind, score))
-            best = score >= ahead
-            ahead = max(ahead, score)
+            best = more_evidence - p.cost >= ahead
+            ahead = max(ahead, more_evidence - p.cost)
             if more and (at_bound(f) or len(p.terms) > 1 and (f.doubtful or best)):
                 simpler = (simpler_law if len(p.terms) > 1 else limit_of)(laws_of(f)[0], f)
-                if scores.get(simpler.kind, -np.inf) < score:
+                if simpler.kind not in {q.kind for q in queue}:
                     queue.append(simpler)
                     more -= 1
-    return tried
+    return [*tried, *_parts(case, parent, tried, leader)]
+
+
+def _parts(
+    case: Case, parent: Fitted, tried: Sequence[tuple[Proposal, Fitted]], leader: Fitted
+) -> list[tuple[Proposal, Fitted]]:
+    """Return the best law without terms that are not apart from none, refitted from its values.
+
+    Refitted from the parent's values, the rest may have ended in a wrong optimum."""
+    out: list[tuple[Proposal, Fitted]] = []
+    while tried and not case.budget.stopped():
+        p, f = max([*tried, *out], key=lambda x: x[1].log_evidence - x[0].cost)
+        law = laws_of(f)[0]
+        if len(p.terms) == 1 or min(apart(law, f)) > SIGNIFICANT:
+            break
+        part = simpler_law(law, f)
+        again = refitted_law(case, parent, part, leader)
+        if again is None or at_bound(again) or again.log_evidence - part.cost <= f.log_evidence - p.cost:
+            break
+        out.append((part, again))
+    return out

@@ -167,18 +167,20 @@ def _likest(term: Term, sizes: Sequence[float], form: Form) -> tuple[Term, tuple
     return dataclasses.replace(term, form=form, shapes=shapes), (size,)
 
 
+def apart(law: PlacedLaw, f: Fitted) -> list[float]:
+    """Return how far the sizes of each term of a law are from none, in standard deviations; the largest."""
+    terms, values = enumerate(law.proposal.terms, 1), f.plant.parameters
+    named = [[law.own[f"{q}{k}"] for q in t.form.sizes] for k, t in terms]
+    return [max(abs(values[n].value) / max(f.sd.get(n, 0.0), 1e-300) for n in own) for own in named]
+
+
 def simpler_law(law: PlacedLaw, f: Fitted) -> Proposal:
     """Return a refitted law without its least significant term, at the values of the refit.
 
     The plant's parameters start there, too."""
     p = settled(law, f)
-    named = [[law.own[f"{q}{k}"] for q in t.form.sizes] for k, t in enumerate(p.terms, 1)]
-    sizes = np.split(np.array(p.sizes), np.cumsum([len(own) for own in named])[:-1])
-    sure = [
-        max(abs(size) / max(f.sd.get(n, 0.0), 1e-300) for size, n in zip(values, own, strict=True))
-        for values, own in zip(sizes, named, strict=True)
-    ]
-    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(sure))]
+    sizes = np.split(np.array(p.sizes), np.cumsum([len(t.form.sizes) for t in p.terms])[:-1])
+    kept = [k for k in range(len(p.terms)) if k != int(np.argmin(apart(law, f)))]
     left = tuple(float(v) for k in kept for v in sizes[k])
     start = {q: v.value for q, v in f.plant.parameters.items()}
     return dataclasses.replace(p, terms=tuple(p.terms[k] for k in kept), sizes=left, start=start)

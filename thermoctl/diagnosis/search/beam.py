@@ -258,8 +258,8 @@ def afresh(s: Search) -> None:
 
     def far(f: Fitted) -> bool:
         """Return whether a parameter is farther from its value in the file than its prior spreads."""
-        there = f.rough_plant.parameters
-        return any(abs(x.z(there[q].value) - x.z(own[q].value)) > BELIEF for q, x in scales.items())
+        there = {q: max(f.rough_plant.parameters[q].value, x.low) for q, x in scales.items()}
+        return any(abs(x.z(there[q]) - x.z(own[q].value)) > BELIEF for q, x in scales.items())
 
     parts = [w for keys, w in s.tried.items() if keys < best.fitted.hypothesis.keys]
     least = -np.inf if far(best.fitted) else best.score - HOPELESS
