@@ -179,6 +179,11 @@ RULES: Mapping[str, Rule] = {
     "mistakes": Rule(
         "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True
     ),
+    "undone": Rule(
+        "an effect that undoes the lag of an input has the odds `rare` once more",
+        {"evidence.odds._undone": _no},
+        searches=True,
+    ),
     "file's values": Rule(
         "parts of the best that are far from the plant file's values are extended from these, too",
         {"search.beam.afresh": lambda s: None},

@@ -74,6 +74,7 @@ def _loop_process(settings: Settings, shared: list[Shared], board: Any) -> int:
         guard(rigs, settings.parts)
 
         def warn(text: str) -> None:
+            """Log a warning."""
             console_log("warning", what=text)
 
         kept = loops.become_real_time(settings, warn)

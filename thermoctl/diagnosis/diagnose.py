@@ -110,6 +110,7 @@ def sought(
     budget = Budget(numbers.fits, say, stopped)
 
     def made(tables: Sequence[Table]) -> Case:
+        """Return the case of recordings."""
         return between(plant, lambda p: case(p, tables, entries, budget, memory, numbers))
 
     known, reserve = steady(made(chosen_on), made, chosen_on, reserve)

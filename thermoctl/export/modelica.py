@@ -77,6 +77,7 @@ def modelica_source(plant: Plant, numbers: Values, model: str) -> str:
     first = names | {o: f"first_{o}" for o in plant.outputs}
 
     def text(expr: Expr) -> str:
+        """Return an expression in Modelica."""
         return written(expr, NOTATION, names.__getitem__, width, first.__getitem__)
 
     lines = []

@@ -40,6 +40,7 @@ def python_source(plant: Plant, numbers: Values) -> str:
     site = {id(z): k for k, (z, _) in enumerate(e.jumps)}
 
     def text(expr: Expr) -> str:
+        """Return an expression as Python text."""
         return written(
             expr,
             NOTATION,

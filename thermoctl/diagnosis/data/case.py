@@ -161,6 +161,7 @@ def _start(d: Excitation, null: Model, model: Model) -> np.ndarray | None:
     plant, by_null, by_model = model.plant, direct_outputs(null.plant), direct_outputs(model.plant)
 
     def start(state: str) -> float:
+        """Return the start of one state."""
         known = state in null.states
         read = (by_null if known else by_model).get(state, "")
         if known or read in d.first:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import Placed
+from thermoctl.diagnosis.hypothesis.candidates import Candidate
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.hypothesis.places import FAULTS
 from thermoctl.diagnosis.limits import Thresholds
@@ -22,9 +23,7 @@ def odds(effects: Sequence[Placed], where: Mapping[str, set[str]], limits: Thres
         c = e.candidate
         share = max(len(where), 1) * len(where.get(c.effect.name, {c.place.where})) * c.clocks
         total += np.log(limits.missing / (1 - limits.missing) / share)
-        # a derivative of a reading, which undoes its lag, follows almost anything
-        undone = any("recorded" in change for change in c.effect.changes[c.variant])
-        total += (rare(c.effect, bool(c.place.input)) + undone) * np.log(limits.rare)
+        total += (rare(c.effect, bool(c.place.input)) + _undone(c)) * np.log(limits.rare)
     return float(total)
 
 
@@ -33,3 +32,8 @@ def rare(effect: Effect, of_input: bool) -> int:
 
     One if it depends on the time itself, and one more if it is a fault of a recorded input."""
     return effect.timed + (of_input and effect.where in FAULTS)
+
+
+def _undone(c: Candidate) -> bool:
+    """Return whether an effect undoes the lag of an input: a derivative follows almost anything."""
+    return any("recorded" in change for change in c.effect.changes[c.variant])

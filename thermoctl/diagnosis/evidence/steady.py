@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -31,7 +32,6 @@ SAME = 4.0  # standard errors of a difference of two means below which they are 
 WHITE = 1.5
 FARTHEST = 3.0  # standard errors by which a fitted level is from its mean at most
 WIDTHS = (2.0, 8.0, 32.0)  # standard deviations of a smoothing Gaussian, in rows
-SCATTER = "scatter about"
 ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
 
 
@@ -51,15 +51,8 @@ class Levels:
         return [np.where(k >= 0, self.values[k], x) for k, x in zip(self.of, columns, strict=False)]
 
 
-@dataclass(frozen=True)
-class Smooth:
-    """The course of an input by recording (N,), smoothed."""
-
-    course: list[np.ndarray]
-
-    def read(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the courses of the first recordings."""
-        return self.course[: len(columns)]
+Courses = Mapping[str, Sequence[np.ndarray]]  # inputs (N,) by column and recording
+Kind = Callable[[Case, Callable[[Sequence[Table]], Case], Sequence[Table], int], Iterator[Courses]]
 
 
 def steady(
@@ -67,60 +60,74 @@ def steady(
 ) -> tuple[Case, list[Table]]:
     """Return the case and the recordings set aside, with inputs without their scatter or as they are.
 
-    Levels, and then smooth courses, are taken where the plant alone fits clearly better with them. `made`:
-    makes the case of recordings. Raises InputError."""
-    given, n = [*tables, *reserve], len(tables)
-    for what, kind in () if case.memory.recordings else (("levels", _levels), ("a smooth course", _courses)):
-        start: float | None = None
-        best, least = (case, given, ""), 0.0
-        try:
-            for found in kind(case, made, given, n):
-                start = alone(case) if start is None else start
-                least = max(least, start + CLEARLY)
-                driven = _driven(given, found)
-                other = made(driven[:n])
-                if (height := alone(other)) <= least:
-                    break
-                best, least = (other, driven, ", ".join(found)), height
-        except (InputError, SimulationError, np.linalg.LinAlgError):
-            pass
-        if best[2] and start is not None:
-            notes = [note for note in case.notes if SCATTER in note]
-            case, given, columns = best
-            case.notes.extend(notes)
-            case.notes.append(
-                f"the readings of {columns} {SCATTER} {what}; with it the plant alone follows the recordings better "
-                f"({least - start:.0f} nats): taken so"
+    Levels, and then the smooth course of each other input, are taken where the plant alone fits clearly
+    better with them. `made`: makes the case of recordings. Raises InputError."""
+    given, n, notes = [*tables, *reserve], len(tables), list[str]()
+    straight = sorted({i.column for i in case.plant.inputs.values() if i.linear})
+    kinds: list[tuple[str, Kind]] = [("levels", _levels)]
+    kinds += [("a smooth course", partial(_smoothed, column=c)) for c in straight]
+    for what, kind in () if case.memory.recordings else kinds:
+        if better := _better(case, made, given, n, kind):
+            case, given, columns, gain = better
+            notes.append(
+                f"the readings of {columns} scatter about {what}; with it the plant alone follows the recordings better "
+                f"({gain:.0f} nats): taken so"
             )
+    case.notes.extend(notes)
     return case, given[n:]
+
+
+def _better(
+    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int, kind: Kind
+) -> tuple[Case, list[Table], str, float] | None:
+    """Return case, recordings, columns and gain, nats, of the best courses; None if none is clearly better.
+
+    Of courses that become better one by one, the last is the best."""
+    best: tuple[Case, list[Table], str, float] | None = None
+    try:
+        for courses in kind(case, made, given, n):
+            if best is None:
+                start = alone(case)
+            driven = _driven(given, courses)
+            other = made(driven[:n])
+            gain = alone(other) - start
+            if gain <= (best[3] if best else CLEARLY):
+                break
+            best = other, driven, ", ".join(courses), gain
+    except (InputError, SimulationError, np.linalg.LinAlgError):
+        pass
+    return best
 
 
 def _levels(
     case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int
-) -> Iterator[dict[str, Levels]]:
+) -> Iterator[Courses]:
     """Yield the levels of inputs, fitted to the first n recordings. Raises InputError, SimulationError."""
     columns = {i.column for i in case.plant.inputs.values()}
     found = {c: v for c in sorted(columns) if (v := levels([t.columns[c] for t in given]))}
     for _ in range(ROUNDS if found else 0):
-        found = _fitted(made(_driven(given, found)[:n]), given[:n], found)
+        found = _fitted(made(_driven(given, _read(given, found))[:n]), given[:n], found)
     if found:
-        yield found
+        yield _read(given, found)
 
 
-def _courses(
-    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int
-) -> Iterator[dict[str, Smooth]]:
-    """Yield the courses of inputs that are read on straight lines, smoother and smoother."""
-    columns = sorted({i.column for i in case.plant.inputs.values() if i.linear})
-    moving = [c for c in columns if all(np.ptp(t.columns[c]) > 0 for t in given)]  # no cell is lost, too
+def _smoothed(
+    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int, column: str
+) -> Iterator[Courses]:
+    """Yield an input that moves and has no lost cell, smoother and smoother."""
+    moving = all(np.ptp(t.columns[column]) > 0 for t in given)
     for width in WIDTHS if moving else ():
-        yield {c: Smooth([gaussian_filter1d(t.columns[c], width) for t in given]) for c in moving}
+        yield {column: [gaussian_filter1d(t.columns[column], width) for t in given]}
 
 
-def _driven(tables: Sequence[Table], found: Mapping[str, Levels | Smooth]) -> list[Table]:
-    read = {c: v.read([t.columns[c] for t in tables]) for c, v in found.items()}
+def _read(tables: Sequence[Table], found: Mapping[str, Levels]) -> Courses:
+    return {c: v.read([t.columns[c] for t in tables]) for c, v in found.items()}
+
+
+def _driven(tables: Sequence[Table], courses: Courses) -> list[Table]:
     return [
-        replace(t, columns={**t.columns, **{c: v[k] for c, v in read.items()}}) for k, t in enumerate(tables)
+        replace(t, columns={**t.columns, **{c: v[k] for c, v in courses.items()}})
+        for k, t in enumerate(tables)
     ]
 
 
@@ -133,7 +140,9 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
 
     def errors(changed: Mapping[str, Levels]) -> np.ndarray:
         """Return the errors of all outputs over their noise (rows,)."""
-        problem = Problem(model, [model.excitation(t) for t in _driven(tables, changed)], fit.noise)
+        problem = Problem(
+            model, [model.excitation(t) for t in _driven(tables, _read(tables, changed))], fit.noise
+        )
         rows = [problem.errors(r, fit.values[r], fit.dx0[r]) / sigma for r in range(len(tables))]
         return np.nan_to_num(np.concatenate(rows).ravel())
 
@@ -144,7 +153,7 @@ def _fitted(case: Case, tables: Sequence[Table], found: Mapping[str, Levels]) ->
         for k in range(len(v.sd))
     ]
     parts = []
-    problem = Problem(model, [model.excitation(t) for t in _driven(tables, found)], fit.noise)
+    problem = Problem(model, [model.excitation(t) for t in _driven(tables, _read(tables, found))], fit.noise)
     for r, d in enumerate(problem.excitations):
         unknowns, _, own = problem.jacobian(r, fit.values[r], fit.dx0[r])
         part = np.zeros((*own.shape[:2], len(problem.unknowns)))

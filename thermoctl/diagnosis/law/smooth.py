@@ -115,6 +115,7 @@ class Tracked:
         storage = self.metric.model.plant.nodes[node].storage
 
         def slope(run: Values, t: np.ndarray) -> np.ndarray:
+            """Return the slope of one recording."""
             unknown = run.get(f"{LATENT}{node}", 0.0) / ex.series(storage, run, t)
             return np.asarray(np.gradient(np.asarray(run[node], float), t) - unknown)
 

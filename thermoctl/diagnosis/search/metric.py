@@ -169,6 +169,7 @@ class Metric:
         plain = self.plain
 
         def response(r: int, values: np.ndarray, dx0: np.ndarray) -> np.ndarray:
+            """Return the rows of one recording."""
             d, changes, buffers = self.drives[r], pushed(r), plain.problem.buffers
             dy = (
                 self.model.respond(d, values, dx0, changes.forces, changes.q, count, buffers=buffers)
