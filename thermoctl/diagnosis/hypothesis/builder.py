@@ -127,7 +127,7 @@ class _Builder:
         self.symbols = self._symbols()
         for p in c.effect.parameters:
             value, span = values.get(p.name, p.null), ranges.get(p.name) or c.bounds(p)
-            self.parameters[c.own(p.name)] = self._parameter(p, float(value), *span)
+            self.parameters[c.own(p.name)] = self._own_parameter(p, float(value), *span)
             self.symbols[p.name] = name(c.own(p.name))
         for e in (*c.symbols.values(), *c.place.symbols.values()):
             for column in ex.names(e) & {*self.rig.spare}:
@@ -163,9 +163,12 @@ class _Builder:
             values = {r: v for r, v in begins.items() if r}
             begin = Parameter(self.c.own("begin"), begins[""], "s", None, True, values)
             self.parameters[begin.name], symbols["t"] = begin, ex.add(name("t"), name(begin.name))
+            there = {r: float(v >= 0) for r, v in values.items()}
+            here = Parameter(self.c.own("here"), float(begins[""] >= 0), "1", None, True, there)
+            self.parameters[here.name], symbols["here"] = here, name(here.name)
         return symbols
 
-    def _parameter(self, p: EffectParameter, value: float, low: float, high: float) -> Parameter:
+    def _own_parameter(self, p: EffectParameter, value: float, low: float, high: float) -> Parameter:
         limits = (low, high) if np.isfinite(low) and np.isfinite(high) and low < high else None
         if limits:
             value = min(max(value, low), high)
@@ -292,6 +295,15 @@ class _Builder:
         n = self.base.nodes[next(iter(self.place.nodes.values()))]
         self.symbols["storage"] = n.storage
         self.nodes[n.name] = dataclasses.replace(n, storage=self.expression(form))
+
+    def _parameter(self, form: str) -> None:
+        """Change a parameter wherever a storage, a flow or an output reads it."""
+        swap = {self.place.where: self.expression(form)}
+        self.nodes = {
+            k: dataclasses.replace(n, storage=ex.fill(n.storage, swap)) for k, n in self.nodes.items()
+        }
+        self.flows = {k: dataclasses.replace(f, rate=ex.fill(f.rate, swap)) for k, f in self.flows.items()}
+        self.outputs = {k: _changed(o, lambda e: ex.fill(e, swap)) for k, o in self.outputs.items()}
 
     def _node(self, what: Mapping[str, Any]) -> None:
         label = self.c.own(what["name"])[:LONGEST]

@@ -77,17 +77,19 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
 def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
     """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
 
-    The event is at the same time of each, or at a time of one that it changes alone or with later ones."""
-    clocks: dict[str, dict[str, float]] = {"": {}}
+    The event is at the same time of each, or at a time of one that it changes alone or with later ones.
+    What differs between recordings does so in one, or from one on: not in all."""
+    differs = effect.where == "free_parameter"
+    clocks: dict[str, dict[str, float]] = {} if differs else {"": {}}
     names = [d.name for d in rig.drives]
     in_pieces = any(d.x0 is not None for d in rig.drives)
-    if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()):
+    if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()) and not differs:
         return clocks
     before, after = -FAR * rig.duration, FAR * rig.duration
-    for k, own in enumerate(names):
+    for k, own in enumerate(names[differs:], differs):
         past = {n: before if j < k else after for j, n in enumerate([*names, ""])}
         clocks[f" from {own}"] = past | {own: 0.0}
-    for own in names[:-1]:
+    for own in names[differs:-1]:
         clocks[f" in {own}"] = dict.fromkeys([*names, ""], before) | {own: 0.0}
     return clocks
 

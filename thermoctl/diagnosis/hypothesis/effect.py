@@ -49,9 +49,10 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "fixed_node": ("T",),
     "fixed_flow": (),
     "power": (),
+    "free_parameter": ("p",),
 }
 """The symbols of each place that an effect's expressions may read; its nodes are also ends of flows."""
-EVERYWHERE = ("air", "reference", "duration", "sample", "t")
+EVERYWHERE = ("air", "reference", "duration", "sample", "t", "here")
 NEEDS = ("x", "v", "i", "T")
 SHAPES: Mapping[str, tuple[str, ...]] = {
     "onsets": ("onset",),
@@ -69,7 +70,7 @@ UNITS_OF = ("unit_of_y", "unit_of_rate", *(f"unit_of_{signal}" for signal in "vx
 """Units of parameters that depend on the place: those of its reading, its flow, and its signals."""
 SIZES = {"times", "lags", "delays", "small_levels"}
 """Kinds of shapes that are a size: at 0 there is no effect."""
-FORMS = ("rate", "value", "voltage", "storage", "drive", "resistance")
+FORMS = ("rate", "value", "voltage", "storage", "drive", "resistance", "parameter")
 PARTS = {
     "flow": (("rate",), ("from", "into")),
     "node": (("name", "storage", "initial"), ("unit", "initial_sigma")),
@@ -162,8 +163,8 @@ class Effect:
 
     @property
     def timed(self) -> bool:
-        """Does it depend on the time itself, or have parameters with a value for each recording?"""
-        named = re.search(r"\bt\b", str(self.changes))
+        """Does it depend on the time or the recording, or have parameters with a value for each recording?"""
+        named = re.search(r"\b(t|here)\b", str(self.changes))
         return bool(named) or any(p.per_recording for p in self.parameters)
 
 

@@ -341,6 +341,16 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
             yield Place(f.name, {}, flow=f.name)
 
 
+def _free_parameters(rig: Rig) -> Iterator[Place]:
+    """Yield parameters with a range that all recordings share, and that a flow, storage or output reads."""
+    p = rig.physics
+    read = [n.storage for n in p.nodes.values()] + [f.rate for f in p.flows.values()]
+    used = set().union(*map(ex.names, [*read, *(o.value for o in p.outputs.values())]))
+    for q in p.parameters.values():
+        if q.name in used and q.range and not q.per_recording:
+            yield Place(q.name, {"p": name(q.name)})
+
+
 # Places where an effect is an error of a reading.
 ERRORS = ("sensor", "body_sensor", "passive_sensor", "recorded_input", "position_sensor")
 FAULTS = (*ERRORS, "reading_in_air")  # places that a trusted reading is not (`Plant.trusts`)
@@ -373,4 +383,5 @@ PLACES = {
     "fixed_node": _fixed_nodes,
     "fixed_flow": _fixed_flows,
     "power": _powers,
+    "free_parameter": _free_parameters,
 }
