@@ -41,7 +41,7 @@ def check_file(path: Path, plants: Sequence[Plant]) -> tuple[str, list[str]]:
 
 
 def made_rig(plant: Plant) -> Rig:
-    """Return a plant with a made recording in which every input moves, so that every place is found."""
+    """Return a plant with two made recordings in which every input moves, so that every place is found."""
     t = 0.5 * np.arange(80)  # not 1 s: a division by it would vanish, and the units with it
     u = np.array([20.0 + np.where(t > 3 * k + 3, 1.0, 0.0) for k in range(len(plant.inputs))])
     first = {i: 20.0 for i in (*plant.inputs, *plant.outputs)}
@@ -49,7 +49,7 @@ def made_rig(plant: Plant) -> Rig:
     linear = np.array([i.linear for i in plant.inputs.values()], np.intc)
     excitation = Excitation("made", t, u.T.reshape(len(t), len(plant.inputs)), y, first, linear)
     columns = {i.column: q for i, q in zip(plant.inputs.values(), u, strict=True)}
-    return Rig(plant, [excitation], [columns])
+    return Rig(plant, [excitation, dataclasses.replace(excitation, name="made again")], [columns, columns])
 
 
 def own_plants() -> list[Plant]:

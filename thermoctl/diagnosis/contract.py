@@ -124,7 +124,9 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
         "confirmed": round(d.asked.get(e.key, 1.0), 4),
         "equation": equation,
         "parameters": {
-            n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit} for n, p in values.items()
+            n: {"value": p.value, "sd": d.best.sd.get(n, 0.0), "unit": p.unit}
+            | ({"values": dict(p.values)} if p.per_recording else {})
+            for n, p in values.items()
         },
         "summary": f"{effect.title} at {e.key[1]}: {equation} with {figures}.",
         **(_of_family(d, family) if family else {}),

@@ -155,7 +155,7 @@ class _Builder:
             if air and unit in TEMPERATURE and air not in ex.names(y):
                 shift = zero_of(unit) - zero_of(self._unit_of(name(air)))
                 symbols["reference"] = ex.add(name(air), num(shift))
-        symbols["duration"] = num(self.rig.duration)
+        symbols["duration"], symbols["here"] = num(self.rig.duration), num(1.0)
         # a parameter, since a bare number of 1 s would vanish from a product, and its unit with it
         sample = Parameter(self.c.own("sample"), float(f"{self.rig.sample:.6g}"), "s")
         self.parameters[sample.name], symbols["sample"] = sample, name(sample.name)

@@ -153,7 +153,7 @@ def short(parameter: str, finding: Result) -> str:
 
 def equation(finding: Result) -> str:
     """Return a finding's equation with the short names of its parameters."""
-    text = str(finding["equation"])
+    text = re.sub(r"\d+\.\d{6,}", lambda m: f"{float(m[0]):.6g}", str(finding["equation"]))
     for n in finding["parameters"]:
         text = text.replace(n, short(n, finding))
     return text
@@ -223,12 +223,18 @@ def parameter_rows(finding: Result) -> Rows:
     rows = [
         (
             short(n, finding) if "effect" in finding else n,
-            with_interval(p["value"], p["sd"], p["unit"]),
+            _between(p) if p.get("values") else with_interval(p["value"], p["sd"], p["unit"]),
             p["unit"] or "",
         )
         for n, p in finding["parameters"].items()
     ]
     return ("parameter", "value, 95 %", "unit"), rows
+
+
+def _between(parameter: Mapping[str, Any]) -> str:
+    """Return the least and the largest value of a parameter that has one for each recording."""
+    ends = sorted({min(parameter["values"].values()), max(parameter["values"].values())})
+    return " .. ".join(with_interval(v, parameter["sd"]) for v in ends)
 
 
 def alternative_rows(result: Result) -> Rows:

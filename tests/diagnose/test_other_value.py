@@ -1,0 +1,45 @@
+"""A parameter that differs between recordings of one rig: a load, a fill, cold grease (a law of 0.91 before)."""
+
+import dataclasses
+
+import pytest
+
+from tests.checks.rigs import inputs
+from tests.plants import ONE_BLOCK
+from thermoctl.diagnosis.contract import contract
+from thermoctl.diagnosis.diagnose import diagnose
+from thermoctl.diagnosis.hypothesis.catalogue import catalogue
+from thermoctl.diagnosis.limits import limits
+from thermoctl.diagnosis.report import words as text
+from thermoctl.plant import loads
+from thermoctl.plant.simulation.simulate import compile_plant
+
+
+def found(factors, parameter="C"):
+    """The result of diagnosing recordings of a block whose parameter is multiplied by each factor in turn."""
+    plant, tables = loads(ONE_BLOCK), []
+    for k, factor in enumerate(factors):
+        p = plant.parameters[parameter]
+        changed = dataclasses.replace(p, value=p.value * factor)
+        real = dataclasses.replace(plant, parameters={**plant.parameters, parameter: changed})
+        table = compile_plant(real).measure(inputs("one block"), 3 + k)
+        tables.append(dataclasses.replace(table, name=f"day_{k + 1}"))
+    return contract(diagnose(plant, tables, catalogue(), limits()))
+
+
+@pytest.mark.parametrize(
+    ("factors", "when"),
+    [((1, 1.2), "from day_2 on"), ((1, 1.2, 1, 1), "in day_2"), ((1, 1.2, 1.2, 1.2), "from day_2 on")],
+)
+def test_a_load_that_differs_is_named_with_its_recording(factors, when):
+    result = found(factors)
+    (finding,) = result["findings"]
+    assert (result["verdict"], finding["effect"], finding["where"]) == ("explained", "other_value", "C")
+    (a,) = finding["parameters"].values()
+    assert a["value"] == pytest.approx(0.2, abs=4 * a["sd"]) and a["sd"] < 0.02
+    assert f"other value {when} at C" in text.words(result)
+    assert any("per_recording: true" in note for note in result["notes"])
+
+
+def test_recordings_of_one_rig_have_no_other_value():
+    assert found((1, 1))["verdict"] == "consistent"
