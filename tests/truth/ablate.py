@@ -153,7 +153,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "levels": Rule(
         "an input whose reading scatters about levels drives the plant by them where it fits better so",
-        {"diagnose.steady": lambda case, made, tables, reserve: (case, [*reserve])},
+        {"diagnose.steady": lambda case, made, tables, reserve: (case, [*reserve], {})},
         searches=True,
     ),
     "place of a flow": Rule(

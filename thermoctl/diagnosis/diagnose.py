@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from thermoctl.checks.hung import without_hung
@@ -109,15 +110,28 @@ def sought(
     chosen_on = [_shared(plant, t, reserve) for t in chosen_on]
     budget = Budget(numbers.fits, say, stopped)
 
-    def made(tables: Sequence[Table]) -> Case:
-        """Return the case of recordings."""
-        return between(plant, lambda p: case(p, tables, entries, budget, memory, numbers))
+    def made(tables: Sequence[Table], of: Plant = plant) -> Case:
+        """Return the case of recordings and a plant."""
+        return between(of, lambda p: case(p, tables, entries, budget, memory, numbers))
 
-    known, reserve = steady(made(chosen_on), made, chosen_on, reserve)
-    known.notes.extend([*hung, *notes, *more])
-    tried = with_laws(search(known))
-    afresh(tried)
-    return Sought(known, searched(tried), tuple(reserve), stopped() and bool(known.budget.untried))
+    def smooth(of: Plant) -> tuple[Case, list[Table], bool]:
+        """Return the plant's case and the reserve with inputs that are steady beside `of`; levels, too?"""
+        beside = partial(made, of=of)
+        found, kept, taken = steady(beside(chosen_on), beside, chosen_on, reserve)
+        known = found if of is plant else made(found.tables)
+        known.notes.extend([*taken.values(), *hung, *notes, *more])
+        return known, kept, "levels" in taken
+
+    known, kept, levels = smooth(plant)
+    tried = search(known)
+    led = set[Keys]()
+    while levels and (keys := tried.best.fitted.hypothesis.keys) and keys not in led and not stopped():
+        led.add(keys)  # levels of the plant alone had taken a part of what it lacks
+        budget.fits, budget.untried = budget.fits_done + numbers.fits, 0
+        known, kept, levels = smooth(tried.best.fitted.rough_plant)
+        tried = search(known)
+    afresh(with_laws(tried))
+    return Sought(known, searched(tried), tuple(kept), stopped() and bool(known.budget.untried))
 
 
 def _shared(plant: Plant, table: Table, reserve: Sequence[Table]) -> Table:

@@ -57,24 +57,23 @@ Kind = Callable[[Case, Callable[[Sequence[Table]], Case], Sequence[Table], int],
 
 def steady(
     case: Case, made: Callable[[Sequence[Table]], Case], tables: Sequence[Table], reserve: Sequence[Table]
-) -> tuple[Case, list[Table]]:
-    """Return the case and the recordings set aside, with inputs without their scatter or as they are.
+) -> tuple[Case, list[Table], dict[str, str]]:
+    """Return the case and the recordings set aside, with inputs without their scatter, and what was taken.
 
     Levels, and then the smooth course of each other input, are taken where the plant alone fits clearly
     better with them. `made`: makes the case of recordings. Raises InputError."""
-    given, n, notes = [*tables, *reserve], len(tables), list[str]()
+    given, n, notes = [*tables, *reserve], len(tables), dict[str, str]()
     straight = sorted({i.column for i in case.plant.inputs.values() if i.linear})
     kinds: list[tuple[str, Kind]] = [("levels", _levels)]
     kinds += [("a smooth course", partial(_smoothed, column=c)) for c in straight]
     for what, kind in () if case.memory.recordings else kinds:
         if better := _better(case, made, given, n, kind):
             case, given, columns, gain = better
-            notes.append(
+            notes[what] = (
                 f"the readings of {columns} scatter about {what}; with it the plant alone follows the recordings better "
                 f"({gain:.0f} nats): taken so"
             )
-    case.notes.extend(notes)
-    return case, given[n:]
+    return case, given[n:], notes
 
 
 def _better(
