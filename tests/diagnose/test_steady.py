@@ -69,6 +69,18 @@ def test_noise_of_an_inputs_reading_is_no_missing_physics(plant, scatter, runs):
     assert any("readings of current scatter" in note for note in result["notes"]) == bool(scatter)
 
 
+def test_levels_take_no_part_of_what_is_missing():
+    """Beside those of the plant alone nothing was sure, or radiation was 6 standard errors off beside a law."""
+    real = ELEVATOR.replace("flows:", "flows:\n  drag: {from: v, rate: 12 * v * abs(v), unit: N}")
+    result = contract(
+        diagnose(loads(ELEVATOR), [run(real, seed, 0.09) for seed in (1, 2)], catalogue(), limits())
+    )
+    (finding,) = result["findings"]
+    (size,) = finding["parameters"].values()
+    assert (result["verdict"], finding["effect"]) == ("explained", "quadratic_drag")
+    assert size["value"] == pytest.approx(12, abs=3 * size["sd"])
+
+
 @given(st.integers(0, 1000))
 @settings(max_examples=30, deadline=None)
 def test_levels_are_the_means_of_all_readings_at_them(seed):
