@@ -240,7 +240,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
         )
     value = None if shape is not None else ex.name("s")
     if trial is not None:
-        steps = {f"s{k}" for k in range(2, 13)} | {"s"}
+        steps = {f"s{k}" for k in range(2, 10)} | {"s"}
         value = _expression(
             trial, {*steps, *given, "first_air", "exponent", *parameters}, f"trial of '{name}'"
         )
