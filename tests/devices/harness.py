@@ -52,7 +52,7 @@ def make(
 
 
 def wait(
-    condition: Callable[[], bool], step: Callable[[], object], what: str = "", limit_s: float = 10.0
+    condition: Callable[[], bool], step: Callable[[], object], what: str = "", limit_s: float = 30.0
 ) -> None:
     """Call `step` until `condition` holds."""
     end = time.monotonic() + limit_s
@@ -78,7 +78,7 @@ class Rig:
         self.sample = self.backend.read(time.monotonic())
         self.backend.write(self.drive, self.enable)
 
-    def until(self, condition: Callable[[], bool], what: str = "", limit_s: float = 10.0) -> None:
+    def until(self, condition: Callable[[], bool], what: str = "", limit_s: float = 30.0) -> None:
         try:
             wait(condition, self.tick, what, limit_s)
         except AssertionError as e:

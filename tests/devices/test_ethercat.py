@@ -168,6 +168,20 @@ def test_single_lost_frames_are_counted_and_keep_the_values(cables, tmp_path):
 
 
 @wire
+def test_a_read_of_the_states_without_an_answer_loses_no_slave(cables, tmp_path):
+    """One such read, which a busy machine misses, counted every slave as gone: the whole bus began anew."""
+    cable = cables(Drive, Terminal)
+    with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable, more=', stale_after_s: 0.3')}]") as rig:
+        rig.drive, rig.enable = 0.2, True
+        rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
+        cable.ask(0, "lost_states", 4)
+        rig.until(lambda: cable.ask(0, "lost_states") == 0)
+        cycles(rig, cable, 200)
+        assert rig.devices[0].counts["reconnections"] == rig.devices[1].counts["reconnections"] == 0
+        assert cable.ask(1, "output") == 100 and cable.ask(1, "enabled_count") == 1
+
+
+@wire
 def test_a_wrong_working_counter_does_not_count_as_a_reading(cables, tmp_path):
     cable = cables(coupler, Terminal)
     with Rig(tmp_path, f"[{terminal(cable, more=', stale_after_s: 0.3')}]") as rig:
@@ -188,8 +202,10 @@ def beside_a_lost_terminal(cables, tmp_path, monkeypatch, way):
     """Yield the cable and the rig of a drive at 100 counts, whose neighbour is lost.
 
     An error of its state machine; a short loss of power; a terminal that is taken out and put back. On a busy
-    machine the slaves miss three frames in a row; then the link counts as lost, and the drive stops."""
+    machine the slaves miss three frames in a row, of data or of states; then the drive stops, and with the
+    terminal away the bus does not begin again."""
     monkeypatch.setattr(bus, "LOST_FRAMES", 1000)
+    monkeypatch.setattr(bus, "SILENT_READS", 20)
     cable = cables(Drive, Terminal)
     with Rig(
         tmp_path, f"[{drive(cable, watchdog_s=5.0)}, {terminal(cable, more=', stale_after_s: 0.3')}]"

@@ -9,6 +9,7 @@ runs the cycle, beside the loop.
     another counter               the states are read: a slave in OP has new inputs, another one is lost
                                   with every slave in OP the frame does not count
     LOST_FRAMES lost in a row     the link is lost
+    SILENT_READS without a state  the slave is lost; one alone may be a lost frame
 
 The first device that connects brings every slave to OP. A slave that is lost later comes back alone, by
 a thread, while the others stay in the cycle.
@@ -29,6 +30,7 @@ from thermoctl_hal.base.backend import HardwareError
 from thermoctl_hal.ethercat.slave import SlaveSetUp
 
 LOST_FRAMES = 3  # frames in a row without an answer, after which the link counts as lost
+SILENT_READS = 3  # reads of the states in a row without an answer, after which a slave counts as lost
 CHECK_S = 0.05  # time between two checks of the slaves' states
 UP_S = 2.0  # longest time for a slave to reach a state
 INIT, PREOP, SAFEOP, OP, ERROR = 1, 2, 4, 8, 16
@@ -48,6 +50,7 @@ class EthercatBus:
         self.users: set[int] = set()
         self.cycle, self.time_s = 0, -1.0
         self.sick: set[int] = set()
+        self._silent: dict[int, int] = {}
         self.lost = self.incomplete = 0
         self._master: Any = None
         self._claim: socket.socket | None = None
@@ -145,7 +148,7 @@ class EthercatBus:
         except BaseException:
             self._close()
             raise
-        self.sick, self._missing = set(), 0
+        self.sick, self._silent, self._missing = set(), {}, 0
 
     def _configure(self) -> None:
         count = self._find()
@@ -233,11 +236,16 @@ class EthercatBus:
         if not is_complete or now_s - self._check_s >= CHECK_S:
             self._check_s = now_s
             self._master.read_state()
-            self.sick = {k for k, s in enumerate(self._master.slaves, 1) if s.state != OP}
+            self.sick = {k for k, s in enumerate(self._master.slaves, 1) if self._is_sick(k, s.state)}
         if is_complete or self.sick:
             self.cycle, self.time_s = self.cycle + 1, now_s
         else:
             self.incomplete += 1
+
+    def _is_sick(self, position: int, state: int) -> bool:
+        """Return whether a slave is in another state than OP, or answered none of SILENT_READS reads."""
+        self._silent[position] = 0 if state else self._silent.get(position, 0) + 1
+        return state not in (0, OP) or self._silent[position] >= SILENT_READS
 
     def problem(self, position: int) -> str:
         """Say in which state a slave is, and why."""
