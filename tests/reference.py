@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from tests.acts import ACTS
-from thermoctl.cli import parser
+from thermoctl.cli.command_line import parser
 from thermoctl.configuration.settings import SECTIONS, options
 from thermoctl.control import causes
 from thermoctl.control.faults import FAULTS, Fault

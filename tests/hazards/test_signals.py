@@ -124,6 +124,25 @@ def test_a_signal_ends_a_command(folder, name, number):
         assert read_table(folder / "cal/test_1.part.parquet").t[-1] >= reached_s - 1.0
 
 
+EARLY = """
+import os, signal, sys
+from thermoctl.cli import main
+class Early:
+    def find_spec(self, name, path, target=None):
+        if name == "thermoctl.cli.command_line":
+            os.kill(os.getpid(), signal.Signals[sys.argv[1]])
+sys.meta_path.insert(0, Early())
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_while_a_command_is_loaded_ends_it_in_one_line(name):
+    """The first 0.2 s of a command are imports: a signal in them ended it with -15 and no line."""
+    done = subprocess.run([sys.executable, "-c", EARLY, name], capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (130, f"thermoctl: ended by {name}\n")
+
+
 HELD = """
 import os, signal, thermoctl.interrupt as i
 i.raise_on_signals()
