@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -252,6 +253,19 @@ def test_a_damaged_description_ends_in_one_line(tmp_path, old, new):
             packed.writestr(item, re.sub(old, new, data) if item.filename.endswith(".xml") else data)
     with pytest.raises(InputError, match=r"damaged.fmu: no usable FMU \(\w+: .*\); export it anew"):
         load(path)
+
+
+@pytest.mark.parametrize("part", [0.003, 0.05, 0.3, 0.6, 0.9, 0.999])
+def test_a_library_that_is_cut_short_ends_in_one_line(tmp_path, part):
+    """Loading it ended the program by SIGBUS, though the archive's own checksums fitted."""
+    whole, cut = block(tmp_path), tmp_path / "cut.fmu"
+    with zipfile.ZipFile(whole) as old, zipfile.ZipFile(cut, "w") as new:
+        for item in old.infolist():
+            data = old.read(item)
+            new.writestr(item, data[: int(part * len(data))] if item.filename.endswith(".so") else data)
+    code = f"from thermoctl.plant.native.fmu import opened; opened({str(cut)!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "cut.fmu: block.so in it is cut short; export it anew" in done.stderr.splitlines()[-1], done
 
 
 def test_what_is_no_usable_fmu_is_said(heater, tmp_path):

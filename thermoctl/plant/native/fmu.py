@@ -15,6 +15,7 @@ import atexit
 import ctypes
 import hashlib
 import shutil
+import struct
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -260,7 +261,26 @@ def _extracted(path: Path, d: ModelDescription) -> str:
     except Exception as e:
         raise InputError(f"{path}: cannot be unpacked: {' '.join(str(e).split())[:300]}") from None
     _compiled(path, d, Path(folder))
+    for file in Path(folder, "binaries").glob(f"*/*{fmpy.sharedLibraryExtension}"):
+        if not _is_whole(file.read_bytes()):
+            raise InputError(f"{path}: {file.name} in it is cut short; export it anew")
     return folder
+
+
+def _is_whole(elf: bytes) -> bool:
+    """Return whether a library has all its segments and sections; loading a cut one ends the program."""
+    if elf[:5] != b"\x7fELF\x02":  # another kind is left to the loader
+        return True
+    try:
+        first, sections = struct.unpack_from("<QQ", elf, 32)
+        size, count, section_size, section_count = struct.unpack_from("<4H", elf, 54)
+        ends = [sections + section_size * section_count]
+        for at in range(first, first + size * count, size):
+            begin, length = struct.unpack_from("<8xQ16xQ", elf, at)
+            ends.append(begin + length)
+    except struct.error:
+        return False
+    return max(ends) <= len(elf)
 
 
 def _compiled(path: Path, d: ModelDescription, folder: Path) -> None:
