@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ import pyarrow.parquet
 
 from thermoctl.files.safe_file import whole_file
 from thermoctl.files.yamlfile import InputError, suggest
-from thermoctl.recording.stream import open_stream, texts
+from thermoctl.recording.stream import CRC, checksums, open_stream, texts
 from thermoctl.recording.table import Table
 
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
@@ -101,7 +101,8 @@ def write_arrow(path: str, kind: str, arrow: pa.Table) -> None:
         else:
             options = pa.ipc.IpcWriteOptions(compression="zstd")
             with pa.ipc.new_file(f, arrow.schema, options=options) as writer:
-                writer.write_table(arrow)
+                for batch in arrow.to_batches():
+                    writer.write_batch(batch, custom_metadata={CRC: checksums(batch)})
 
 
 def to_arrow(table: Table) -> pa.Table:
@@ -342,7 +343,7 @@ def arrow_of(path: Path, want: list[str] | None = None) -> pa.Table:
             with pa.ipc.open_file(source) as f:
                 rows = sum(f.get_batch(i).num_rows for i in range(f.num_record_batches))
                 _limit(path, rows, len(picked(path, f.schema.names, want)))
-                return f.read_all()
+                return pa.Table.from_batches(_batches(path, f), f.schema)
     stream = open_stream(path, want and [*want, "t", "t_s"])
     batches, rows = [], 0
     for batch in stream:
@@ -350,6 +351,15 @@ def arrow_of(path: Path, want: list[str] | None = None) -> pa.Table:
         _limit(path, rows, batch.num_columns)
         batches.append(batch)
     return pa.Table.from_batches(batches, stream.schema)
+
+
+def _batches(path: Path, f: pa.RecordBatchFileReader) -> Iterator[pa.RecordBatch]:
+    """Yield a file's batches. Raises InputError for one whose own checksums do not fit; most have none."""
+    for i in range(f.num_record_batches):
+        batch, said = f.get_batch_with_custom_metadata(i)
+        if said and CRC in said and said[CRC] != checksums(batch):
+            raise InputError(f"{path}: not a whole file: its batch {i + 1} was changed (checksum)")
+        yield batch
 
 
 READERS: dict[str, Callable[[Path, list[str] | None], Raw]] = {

@@ -29,8 +29,9 @@ def texts(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
 
 
 def checksums(batch: pa.RecordBatch) -> bytes:
-    """Return the CRC-32 of every column's numbers (float64 without nulls), 4 bytes each, little endian."""
-    return np.array([zlib.crc32(column.to_numpy()) for column in batch.columns], dtype="<u4").tobytes()
+    """Return the CRC-32 of every column's numbers (float64, null as NaN), 4 bytes each, little endian."""
+    numbers = (column.to_numpy(zero_copy_only=False) for column in batch.columns)
+    return np.array([zlib.crc32(c.tobytes()) for c in numbers], dtype="<u4").tobytes()
 
 
 @dataclass
