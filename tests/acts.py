@@ -88,7 +88,7 @@ ACTS = (
     ),
     Act(
         "reload",
-        "applies changed limits and gains between two ticks; while ARMED none by which the output jumps or leaves its setpoint",
+        "applies changed limits and gains between two ticks, none that vanished; while ARMED none by which the output jumps or leaves its setpoint",
         _OWN,
         "its purpose",
         "1 refused, or the file is not valid; 2 no daemon",

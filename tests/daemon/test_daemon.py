@@ -133,6 +133,7 @@ JUMPS = (
     ("slew_um_s: 1\n", "slew_um_s: 1e4\n", "compensation.slew_um_s 1 -> 10000"),
     ("setpoint_high_um: 250", "setpoint_high_um: 2", "high_um -250..2, the setpoint is 3 now"),
     ("setpoint_low_um: -250", "setpoint_low_um: 4", "high_um 4..250, the setpoint is 3 now"),
+    ("enable: true", "enable: false", "compensation.enable true -> false"),
 )
 
 
@@ -152,6 +153,19 @@ def test_a_reload_moves_no_armed_output_by_a_jump(daemon):
     daemon.ask("disarm")
     daemon.config.write_text(text.replace("kp: 0.01", "kp: 0.02"))
     assert daemon.ask("reload")["applied"] == ["control.kp"]  # disarmed: nothing to jump
+
+
+def test_a_reload_takes_no_limit_away(daemon):
+    """A file that was cut at the end of a line was valid, and missing limits took their defaults."""
+    text = daemon.config.read_text()
+    for line in ("drift_limit_c: 4", "current_tolerance_a: 0.02", "setpoint_low_um: -250", "bound_um: 40"):
+        daemon.config.write_text(text.replace(f"  {line}\n", "", 1).replace(f"  {line} ", "  # ", 1))
+        answer = daemon.ask("reload")
+        assert not answer["ok"] and f"{line.split(':')[0]}: in force, and no longer in" in answer["error"]
+    daemon.config.write_text(text.replace("stale_s: {position_um: 5}", "stale_s: {}"))
+    assert "protection.stale_s.position_um: in force" in daemon.ask("reload")["error"]
+    daemon.config.write_text(text.replace("coil_limit_c: 80", "coil_limit_c: 85"))
+    assert daemon.ask("reload")["applied"] == ["protection.coil_limit_c"]
 
 
 @pytest.mark.parametrize(

@@ -308,7 +308,7 @@ class Settings:
     A rig file with `axes` gives two kinds of settings. The settings of one axis have the same fields as
     those of a rig without axes; `axis` is its name, `rig_socket` the rig's socket. The settings of the whole
     rig have `axes` and the channels of all axes. Their sections `control`, `compensation` and `protection`
-    are those of the first axis."""
+    are those of the first axis. `given` lists the options that the file has, as section.key."""
 
     path: str
     rig: RigSettings
@@ -323,6 +323,7 @@ class Settings:
     axis: str = ""
     rig_socket: str = ""
     axes: tuple[Settings, ...] = ()
+    given: frozenset[str] = frozenset()
 
     @property
     def parts(self) -> tuple[Settings, ...]:
@@ -577,10 +578,12 @@ def _check_roles(device: Node, channels: AxesChannels) -> None:
 def _settings(node: Node, path: str | Path, channels: Channels) -> Settings:
     """Read the sections of a rig without axes, or of one axis."""
     root, folder = Section(node, "configuration"), Path(path).absolute().parent
+    present = {name: root.given(name) for name in SECTIONS}
     sections = {
-        name: _section(name, cls, root.given(name), root.node, channels) for name, cls in SECTIONS.items()
+        name: _section(name, cls, present[name], root.node, channels) for name, cls in SECTIONS.items()
     }
-    settings = Settings(path=str(path), **sections, channels=channels)
+    given = frozenset(f"{name}.{key}" for name, node in present.items() if node for key in node.value)
+    settings = Settings(path=str(path), **sections, channels=channels, given=given)
     _check_together(settings, root.node)
     return dataclasses.replace(
         settings,

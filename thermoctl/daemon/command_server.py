@@ -205,10 +205,15 @@ class Commands:
             found.append(
                 f"control.setpoint_low_um..high_um {low:g}..{high:g}, the setpoint is {setpoint:g} now"
             )
+        if old.compensate != new.compensate:
+            found.append(f"compensation.enable {old.compensate > 0.0} -> {new.compensate > 0.0}".lower())
+        if abs(row[AT["compensation_um"]]) > new.bound_um:
+            now = row[AT["compensation_um"]]
+            found.append(f"compensation.bound_um {new.bound_um:g}, the compensation is {now:g} now")
         if found:
             raise InputError(
                 f"{self.settings.path}: nothing was changed, the output of the armed rig would move: "
-                f"{'; '.join(found)}. While ARMED a reload changes each by a factor of {LIVE_STEP:g} at most: go in "
+                f"{'; '.join(found)}. While ARMED a reload changes a gain by a factor of {LIVE_STEP:g} at most: go in "
                 "steps, or disarm first"
             )
 
