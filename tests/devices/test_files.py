@@ -588,6 +588,23 @@ def test_words_without_their_semicolon_count(tmp_path, fault):
     assert read(dev, (801, bytes.fromhex("ffff000000000000"))).status[ROLE["voltage_v"]] == ERROR
 
 
+@pytest.mark.parametrize("fault", ["", FAULTS["a factor without a zero"]])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        'VAL_ 801 Volts 65535 "SNA" ;\nVAL_ 801 T 255 "SNA" ;\nVAL_ 801 Volts 65534 "Error" ;\n',
+        'VAL_TABLE_ None 65535 "SNA" 65534 "Error" ;\nVAL_ 801 Volts None ;\n',
+        'VAL_ 801 Volts None ;\nVAL_TABLE_ None 65535 "SNA" 65534 "Error" ;\n',
+    ],
+)
+def test_words_in_two_lines_or_in_a_table_count(tmp_path, fault, lines):
+    """The last line of a signal counted alone: 655.35 V was a reading. The name of a table was refused."""
+    dev = device(tmp_path, START + fault + GOOD + lines, [V], "{v: voltage_v}")
+    for data, status in (("ffff", ERROR), ("feff", ERROR), ("fdff", OK)):
+        found = read(dev, (801, bytes.fromhex(data.ljust(16, "0"))))
+        assert found.status[ROLE["voltage_v"]] == status
+
+
 @pytest.mark.parametrize("value", ["99", '"StandardCAN_FD"'])
 def test_a_wrong_frame_format_is_passed_over(tmp_path, value):
     """It was refused with 'list index out of range'."""

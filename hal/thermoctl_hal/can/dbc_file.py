@@ -48,6 +48,9 @@ _KIND = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\b", re.IGNORECASE)
 _PAGE = re.compile(r"m\d")
 _WORDS_OF = re.compile(r"\s*VAL_\s+(\d+)\s+(\S+)")
 _WORDS = re.compile(r'\s*VAL_\s+(\d+)\s+\S+(?:\s+-?\d+\s+"(?:[^"\\]|\\.)*")*\s*;\s*')
+_VALUES = re.compile(r'(?m)^[ \t]*VAL_\s+(\d+)\s+(\S+)((?:\s+-?\d+\s+"(?:[^"\\]|\\.)*")+)\s*;')
+_TABLE = re.compile(r'(?m)^[ \t]*VAL_TABLE_\s+(\w+)((?:\s+-?\d+\s+"(?:[^"\\]|\\.)*")+)\s*;')
+_BY_TABLE = re.compile(r"(?m)^([ \t]*VAL_\s+\d+\s+\S+)\s+([A-Za-z_]\w*)\s*;")
 # Words of a signal without the semicolon at their end, which cantools passes over.
 _UNENDED = re.compile(
     r'(?m)^(\s*VAL_\s+\d+\s+\S+(?:[ \t]+-?\d+[ \t]+"(?:[^"\\\n]|\\.)*")+)[ \t\r]*$(?!\s*[;\d-])'
@@ -94,7 +97,7 @@ def load_dbc(path: Path) -> DbcFile:
     """Read a DBC file. Raises OSError; ValueError where no message can be read."""
     from cantools.database import load_string
 
-    text = _UNENDED.sub(r"\1 ;", read_text(path))
+    text = _with_words(_UNENDED.sub(r"\1 ;", read_text(path)))
     logging.getLogger("cantools").setLevel(logging.ERROR)  # cantools warns of names that are defined twice
     try:
         database: Any = load_string(text, database_format="dbc")
@@ -112,6 +115,28 @@ def load_dbc(path: Path) -> DbcFile:
         for message in blocks.database.messages:
             message.protocol = "j1939"
     return replace(blocks, faults={**blocks.faults, **_misread(text, blocks.database)})
+
+
+def _with_words(text: str) -> str:
+    """Return the file with the words of each signal in one VAL_ line, and those of its table in it.
+
+    cantools keeps the last line of a signal, and takes no name of a table."""
+    tables = dict(_TABLE.findall(text))
+    text = _BY_TABLE.sub(lambda m: f"{m[1]}{tables[m[2]]} ;" if m[2] in tables else m[0], text)
+    words: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for number, signal, more in _VALUES.findall(text):
+        words[number, signal].append(more.replace("\n", " "))
+    several = {key for key, lines in words.items() if len(lines) > 1}
+
+    def whole(m: re.Match[str]) -> str:
+        """Return a signal's first line with the words of all, its others empty."""
+        if (m[1], m[2]) not in several:
+            return m[0]
+        lines = words.pop((m[1], m[2]), None)
+        kept = f"VAL_ {m[1]} {m[2]}{''.join(lines)} ;" if lines else ""
+        return kept + "\n" * m[0].count("\n")
+
+    return _VALUES.sub(whole, text)
 
 
 def _misread(text: str, database: Database) -> dict[str, str]:
