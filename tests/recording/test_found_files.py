@@ -742,3 +742,89 @@ def test_a_clock_that_is_set_during_the_recording(tmp_path, first, form):
     found = read(tmp_path, rows("time,T", *(f"{c},{k}" for k, c in enumerate(cells))))
     assert found.t[:5].tolist() == [0, 1, 2, 3, 4] and found.t[5] == (stamps[5] - begin).total_seconds()
     assert any(f"leap from {first[:10]}" in n and "was the clock set" in n for n in found.notes)
+
+
+def test_a_comment_without_words_is_no_header(tmp_path):
+    """It ended with a traceback."""
+    with pytest.raises(InputError):
+        read(tmp_path, "#\n*")
+
+
+SECONDS = range(90)
+CLOCKS = {  # header and row of a table whose clock has a column for each part
+    "parts of a day": ("hh,mm,ss,T", "10,{m},{s},{v}"),
+    "whole words": ("Hour,Minute,Second,T", "10,{m},{s},{v}"),
+    "behind a date": ("Date,HH,MM,SS,T", "2025-01-02,10,{m},{s},{v}"),
+    "months and minutes": ("YYYY,MM,DD,hh,mm,ss,T", "2025,1,2,10,{m},{s},{v}"),
+    "two digits of a year": ("YY,MM,DD,hh,mm,ss,T", "25,1,2,10,{m},{s},{v}"),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_a_clock_in_columns_of_its_parts(tmp_path, name):
+    """`mm` behind hh is a minute: it was the month, a second a month, where MM stood before it."""
+    header, row = CLOCKS[name]
+    found = read(tmp_path, rows(header, *(row.format(m=k // 60, s=k % 60, v=20 + k) for k in SECONDS)))
+    assert found.t.tolist() == [*SECONDS] and list(found.columns) == ["T"]
+    start = found.meta.get("start")
+    assert start == (None if name in ("parts of a day", "whole words") else "2025-01-02T10:00:00.000")
+
+
+def test_parts_of_a_day_go_on_past_midnight(tmp_path):
+    found = read(tmp_path, rows("hh,mm,T", "23,58,1", "23,59,2", "0,0,3", "0,1,4"))
+    assert found.t.tolist() == [0, 60, 120, 180]
+
+
+@pytest.mark.parametrize("name", ["MJD", "time_mjd", "Modified Julian Date", "time (MJD)"])
+def test_modified_julian_days(tmp_path, name):
+    """They are as large as the days of Excel, and were read as those of the year 2066."""
+    found = read(tmp_path, rows(f"{name},T", *(f"{60676.5 + k / 1440:.8f},{20 + k % 3}" for k in range(9))))
+    np.testing.assert_allclose(found.t, 60 * np.arange(9), atol=1e-3)
+    assert found.meta["start"] == "2025-01-01T12:00:00.000"
+
+
+FETCHED = "                 ds0          ds1\n\n" + rows(
+    *(f"{1700000000 + 300 * k}: {2.1e1 + k:.10e} 3.3e+01" for k in range(6)), "1700001800: -nan -nan"
+)
+XPORT = (
+    '{ %s,\n"meta": {"start": 1700000000, "step": 300, "end": 1700001800, "legend": ["ds0", "ds1"]},\n'
+    '"data": [' + ",".join(f"[ {2.1e1 + k:.10e}, 33.0 ]" for k in range(6)) + "]}"
+)
+
+
+@pytest.mark.parametrize("about", ["", "about: 'RRDtool xport JSON output'", '"about": "RRDtool"'])
+def test_what_rrdtool_writes(tmp_path, about):
+    """Of its JSON the first signal was read as the time."""
+    found = read(tmp_path, XPORT % about, "x.json") if about else read(tmp_path, FETCHED)
+    assert found.columns["ds0"][:6].tolist() == [21, 22, 23, 24, 25, 26]
+    assert found.t[:6].tolist() == [0, 300, 600, 900, 1200, 1500]
+    assert found.meta["start"] == "2023-11-14T22:13:20.000Z"
+
+
+@pytest.mark.parametrize(
+    "cells, names", [("{v}", ["probe_0"]), ("({v} 0 1)", [f"probe_0_{k}" for k in "123"])]
+)
+def test_the_probes_of_openfoam(tmp_path, cells, names):
+    head = rows("# Probe 0 (0.1 0 0)", "#       Probe             0", "#        Time")
+    lines = [f"{k * 0.5:13.1f}   {cells.format(v=300 + k)}" for k in range(5)]
+    found = read(tmp_path, head + rows(*lines), "T")
+    assert list(found.columns) == names and found.columns[names[0]].tolist() == [300, 301, 302, 303, 304]
+    assert found.t.tolist() == [0, 0.5, 1, 1.5, 2]
+    with pytest.raises(InputError, match=r"T:8: .*was it cut"):
+        read(tmp_path, head + rows(*lines[:4], "  2.0"), "T")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[2025-01-02 10:00:0{k}] INFO T=2{k}.5 P=3",
+        "2025-01-02 10:00:0{k},000 - root - INFO - P=3, T=2{k}.5 degC",
+        "[2025-01-02T10:00:0{k}] INFO: T=2{k}.5, P=3 W",
+    ],
+)
+def test_the_log_of_a_program(tmp_path, line):
+    text = rows("[2025-01-02 09:59:59] INFO started", *(line.format(k=k) for k in range(6)))
+    found = read(tmp_path, text, "run.log")
+    assert found.columns["T"].tolist() == [20.5 + k for k in range(6)] and found.t.tolist() == [*range(6)]
+    assert found.columns["P"].tolist() == [3] * 6 and "1 lines without a date" in found.notes[0]
+    assert found.units == ({"T": "degC"} if "degC" in line else {"P": "W"} if " W" in line else {})

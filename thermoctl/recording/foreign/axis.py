@@ -108,6 +108,7 @@ def _run(t: np.ndarray) -> tuple[int, str]:
 
 
 _BRACKETED = re.compile(r"\(([^\W\d_]{1,4}|(?:tick|sample|frame|count|cycle|step|point)s?)\.?\)$")
+_MODIFIED = re.compile(r"(?i)(?<![a-z])mjd(?![a-z])|modified.?julian")
 _MINUTES = re.compile(r"(?i)(?<![:\w])m+(?:in\w*)?:s")  # a header such as "Time (min:sec)"
 
 
@@ -130,7 +131,9 @@ def read(name: str, cells: Cells, unit: str | None, is_time: bool = False) -> Se
         # A short word in round brackets is a unit, as in `Time (HH)`. A longer one, as `(elapsed)`, is none.
         written = unit or next(iter(_BRACKETED.findall(name)), None)
         stated, header = unit_of_time(name, unit, is_time), f"{name} [{unit}]" if unit else name
-        seconds = clock.from_numbers(cells, stated, named(name) > 0)
+        if modified := _MODIFIED.search(f"{name} {unit or ''}") is not None:
+            stated = None
+        seconds = clock.from_numbers(cells, stated, named(name) > 0 or modified, modified)
         if seconds.kind != "epoch" and has_factor(header) and (stated or named(name) > 0):
             raise ClockError(
                 0, f"'{header}' counts in steps; write it in s, or say --time 0.1s for even rows"

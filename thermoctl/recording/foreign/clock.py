@@ -104,6 +104,7 @@ EPOCHS = (
     ("days since 1900 (Excel)", DAY_S, _1899, 36_526.0, 73_050.0),
     ("days since the year 0 (MATLAB)", DAY_S, -719_529.0 * DAY_S, 730_486.0, 767_011.0),
     ("millionths of a day since 1900 (WinCC)", DAY_S / 1e6, _1899, 3.6e10, 7.3e10),
+    ("modified Julian days", DAY_S, -40_587.0 * DAY_S, 15_020.0, 88_070.0),
     ("Julian days", DAY_S, -2_440_587.5 * DAY_S, 2_451_544.0, 2_488_070.0),
 )
 YEARS = 20, 39  # range of two digits that are a year rather than a day
@@ -259,12 +260,15 @@ def _are_parted(texts: pa.Array) -> pa.Array:
     return pc.and_(pc.match_substring_regex(texts, _PARTED), pc.match_substring_regex(texts, _PARTS))
 
 
-def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True) -> Seconds:
+def from_numbers(values: np.ndarray, unit: str | None, dated: bool = True, modified: bool = False) -> Seconds:
     """Return numbers as seconds: by their epoch, else in the unit that the header states.
 
-    `dated`: the name is one of a date or a time, so that small counts (days of Excel) may be dates."""
+    `dated`: the name is one of a date or a time, so that small counts (days of Excel) may be dates.
+    `modified`: its name says that it counts modified Julian days, which are as large as those of Excel."""
     finite = values[np.isfinite(values)]
     for name, scale, zero, low, high in EPOCHS if len(finite) else ():
+        if modified != name.startswith("modified"):
+            continue
         stated = unit is None or abs(SECONDS.get(unit, np.nan) - scale) < 1e-9 * scale
         stated = stated or ("WinCC" in name and unit == "ms" and bool(np.any(finite % 1)))  # its Time_ms
         unset = int(np.argmax(finite >= low)) if name.startswith("unix") and finite[0] >= 0 else 0

@@ -605,7 +605,7 @@ def _is_kinds(cells: list[str]) -> bool:
 def _commented(comments: list[tuple[int, str]], separator: str, width: int) -> list[tuple[int, list[str]]]:
     """Return the last comment as wide as the data, of units with that above: numpy, gnuplot, others."""
     found: list[tuple[int, list[str]]] = []
-    for number, text in reversed(comments):
+    for number, text in (c for c in reversed(comments) if c[1].strip()):
         for sep in (separator, ",", ";", "\t", "  ", " "):
             cells = cells_of(text, sep)
             stated = _STATED.match(text) or (cells[0].endswith(":") and not cells[-1].endswith(":"))

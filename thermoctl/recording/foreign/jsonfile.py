@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from thermoctl.recording.foreign.units import WORDS, known, named, spelled
 IDS = WORDS["identities"].split()
 # Keys of Home Assistant's websocket. Its "lc", the last change, is stated only where it is not "lu".
 _SHORT = {"s": "state", "a": "attributes", "lu": "time"}
+_ABOUT = re.compile(r"(?<=\{ )about: '([^'\n]*)'")  # as rrdtool xport --json writes it
 _GRAFANA = dict(pair.split("=") for pair in WORDS["grafana"].split())
 
 
@@ -24,7 +26,7 @@ def read_json(path: Path, text: str) -> list[Sheet] | None:
     """Return the tables of a JSON text, or of lines of JSON; None for another text. Raises InputError."""
     notes: list[str] = []
     try:
-        content = json.loads(text)
+        content = json.loads(_ABOUT.sub(r'"about": "\1"', text, count=1))
     except ValueError as e:
         content = _json_lines(path, text, notes)
         if not content:
@@ -64,7 +66,7 @@ def _tables(path: Path, content: Any) -> list[Sheet] | None:
         return _of_list(path, content)
     if not isinstance(content, dict):
         return None
-    for reader in (_thingspeak, _fields, _series, _temperature_store, _websocket, _indexed):
+    for reader in (_rrdtool, _thingspeak, _fields, _series, _temperature_store, _websocket, _indexed):
         if sheets := reader(path, content):
             return sheets
     if sheet := _lists(path, content):
@@ -146,6 +148,20 @@ def _of_objects(path: Path, content: list[dict[str, Any]]) -> list[Sheet]:
     ):
         raise InputError(f"{path}: {len(tables)} objects of lists; one was expected: write a file of each")
     return [of_records(path, content)]
+
+
+def _rrdtool(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:
+    """Read what rrdtool xport writes: the names and the first time beside rows, with or without times."""
+    meta, rows = content.get("meta"), content.get("data")
+    if not isinstance(meta, dict) or not {"start", "step", "legend"} <= meta.keys():
+        return None
+    names = ["time", *meta["legend"]]
+    if not isinstance(rows, list) or not all(isinstance(r, list) for r in rows):
+        return None
+    timed = [
+        r if len(r) == len(names) else [meta["start"] + k * meta["step"], *r] for k, r in enumerate(rows)
+    ]
+    return [of_records(path, [dict(zip(names, r, strict=False)) for r in timed])]
 
 
 def _thingspeak(path: Path, content: Mapping[str, Any]) -> list[Sheet] | None:

@@ -20,7 +20,7 @@ from thermoctl.recording.foreign.cells import PAIRS, is_number
 from thermoctl.recording.foreign.dialect import cells_of
 from thermoctl.recording.foreign.jsonfile import IDS, read_json
 from thermoctl.recording.foreign.sheet import Sheet, of_lists, of_records
-from thermoctl.recording.foreign.units import NO_NAME, WORDS, named, spelled, states_unit_of
+from thermoctl.recording.foreign.units import NO_NAME, WORDS, known, named, spelled, states_unit_of
 
 VALUES = WORDS["values"].split()
 _BOOKKEEPING = {"result", "table", "_start", "_stop", "_measurement"}
@@ -33,6 +33,11 @@ _LABEL_ALONE = r"^.*\w[:=]$|^[^\s/]+/\S+$"  # `2:`, `T=`, and a topic of MQTT
 _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*[:=]\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
+)
+_STAMP = re.compile(r"^\[?(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?(?:Z|[+-]\d\d:?\d\d)?)(?=[\]\s,])")
+# T=20.1 degC of a log's line; the unit is no name of the next pair.
+_PAIR = re.compile(
+    r"([^\W\d]\w*)=([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?![\w.:/-])(?: ?([^\s,;=\d][^\s,;=]*)(?![^\s,;]*=))?"
 )
 FEW = 20  # number of first rows that show whether a column is a clock
 ENOUGH = 0.75  # least share of the times at which each signal of a long table has a row
@@ -141,6 +146,47 @@ def _labelled(path: Path, text: str) -> list[Sheet] | None:
     return [of_records(path, records)]
 
 
+def _logged(path: Path, text: str) -> list[Sheet] | None:
+    """Read a program's log: the lines with a date and `T=20.1 degC`. Others are left out with a note."""
+    records, places = [], []
+    units: dict[str, str | None] = {}
+    every = [(n, x) for n, x in enumerate(text.splitlines(), 1) if x.strip()]
+    for number, line in every:
+        stamp, found = _STAMP.match(line), _PAIR.findall(line)
+        if stamp and found:
+            records.append({"time": stamp[1]} | {name: value for name, value, _ in found})
+            places.append(number)
+            units |= {name: spelled(unit, name) for name, _, unit in found if known(unit)}
+    if 2 * len(records) < len(every):
+        return None
+    sheet = of_records(path, records)
+    sheet.units = {k: v for k, v in units.items() if v}
+    sheet.place = lambda row: f"{path}:{places[row]}"
+    if len(records) < len(every):
+        sheet.notes.append(f"{len(every) - len(records)} lines without a date and NAME=NUMBER left out")
+    return [sheet]
+
+
+def _probes(path: Path, text: str) -> list[Sheet] | None:
+    """Read the probes of OpenFOAM: a column a probe, several of one with vectors."""
+    probes = re.findall(r"(?m)^#\s*Probe\s+(\d+)\s+\(", text)
+    rows = [(n, re.sub(r"[()]", " ", x).split()) for n, x in enumerate(text.splitlines(), 1) if x[:1] != "#"]
+    rows = [(n, cells) for n, cells in rows if cells]
+    size = (len(rows[0][1]) - 1) // len(probes) if rows else 0
+    names = [f"probe_{p}" + (f"_{k + 1}" if size > 1 else "") for p in probes for k in range(size)]
+    for number, cells in rows:
+        if len(cells) != len(names) + 1:
+            raise InputError(
+                f"{path}:{number}: {len(cells)} numbers; {len(names) + 1} were expected (was it cut?)"
+            )
+    columns = zip(*(cells for _, cells in rows), strict=True)
+    sheet = of_lists(
+        path, dict(zip(["Time", *names], columns, strict=True)), lambda row: f"{path}:{rows[row][0]}"
+    )
+    sheet.units = {"Time": "s"}
+    return [sheet]
+
+
 def _tektronix(path: Path, text: str) -> list[Sheet] | None:
     """Read the table of a Tektronix TDS: key, value, empty, time, value in each line."""
     rows = [cells_of(x, ",") for x in text.splitlines() if x.strip()]
@@ -162,6 +208,8 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
     (re.compile(r"\A(?:#.*\n|\s*\n)*[^\s,]\S* \S+=\S.* -?\d+\s*$", re.MULTILINE), _points),
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
     (re.compile(r"\A\W?\w?Record Length\"?,"), _tektronix),
+    (re.compile(r"\A#\s*Probe 0 \("), _probes),
+    (re.compile(rf"{_STAMP.pattern}[^=\n]*(?:INFO|DEBUG|WARN|ERROR)[^=\n]*=[-+\d]", re.MULTILINE), _logged),
     (re.compile(rf"\A{_LABELS.pattern}\s*$", re.MULTILINE), _labelled),
 )
 

@@ -81,6 +81,7 @@ _ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and
 SHOWN = 8192  # number of last bytes that show the digits of the last column
 FEW = 6  # least number of lines that show them
 _STAMPED = re.compile(rb"(?m)^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # Arduino's monitor before each line
+_FETCHED = re.compile(rb"(?m)^(\d{9,10}):(?=[ \t])")  # the times of rrdtool fetch
 _SUFFIXES = {".mf4": "mdf", ".mdf": "mdf", ".tdms": "tdms", ".xlsx": "excel", ".xlsm": "excel"}
 _SUFFIXES |= {
     ".parquet": "parquet",
@@ -211,7 +212,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise formats.frames(path)
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
-    text = _one_header(_with_whole_cells(text), notes)
+    text = _one_header(_with_whole_cells(_fetched(text)), notes)
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)
         notes.append("whole lines stand in quotes; read without them")
@@ -239,6 +240,13 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
     stated = _stated(sheet, dialect)
     stated[0].again = closely  # reading cell by cell gives an error with the line
     return stated
+
+
+def _fetched(text: bytes) -> bytes:
+    """Return what rrdtool fetch wrote with a name of its times, and without the colon behind each."""
+    if not _FETCHED.search(text[:HEAD]):
+        return text
+    return re.sub(rb"\A\s*(?=[^\W\d])", b"time ", _FETCHED.sub(rb"\1", text))
 
 
 def _with_whole_cells(text: bytes) -> bytes:

@@ -29,13 +29,13 @@ EVENER, ENOUGH = 0.5, 20
 _COUNTS, _OF_DAY = re.compile(r"(?i)elapsed|run|lauf|uptime|since|seit"), re.compile(r"(?i)hour|hh|uhr")
 _ZONES = ("utc", "gmt", "lst", "mst", "mdt", "pst", "pdt", "cst", "cdt", "est", "edt")  # MIDC
 _FIELDS = {  # names of the parts of a date that have a column each
-    "year": ("year", "yyyy", "yr", "jahr", "annee", "año", "anno"),
+    "year": ("year", "yyyy", "yy", "yr", "jahr", "annee", "año", "anno"),
     "month": ("month", "mm", "mo", "mon", "monat", "mois", "mes", "mese"),
     "day": ("day", "dd", "dy", "tag", "jour", "dia", "día", "giorno"),
     "doy": ("doy", "julian", "jday", "julday", "day_of_year", "dayofyear", "jd"),
     "hour": ("hour", "hh", "hr", "stunde", "heure", "hora", "ora"),
     "hhmm": ("hhmm", "time", "hourmin", "hour_minute", *_ZONES),
-    "minute": ("minute", "min", "mi", "minuto", "minuti"),
+    "minute": ("minute", "min", "mi", "mn", "minuto", "minuti"),
     "second": ("second", "ss", "sec", "sekunde", "seconde", "segundo", "secondo"),
 }
 # Orders and ranges of these parts in the first columns of a table without names, as weather files have them.
@@ -67,9 +67,42 @@ def joined(sheet: Sheet, read: dict[str, Seconds]) -> Iterator[tuple[tuple[str, 
             start = clock.later(seconds.start, float(part[0])) if seconds.start else None
             whole = replace(seconds, t=t, start=start, note=seconds.note + f" and {unit}")
             yield (*columns, names[after]), whole, 2
-    at = {key: n for n in sheet.columns for key, names in _FIELDS.items() if n.strip().lower() in names}
+    at = _named_parts(sheet)
     if (parts := _of_parts(sheet, at) or _of_first_columns(sheet)) is not None:
         yield *parts, 2
+    elif (hms := _of_day(sheet, at)) is not None:
+        used, since = hms
+        t = since + clock.DAY_S * np.concatenate([[0], np.cumsum(np.diff(since) < -clock.DAY_S / 2)])
+        note = "hour, minute and second put together"
+        yield used, Seconds(t - t[0], None, note, "time of day"), 2
+        for date in dates:
+            t = read[date].t + since
+            start = clock.later(str(read[date].start), float(t[0]))
+            yield (date, *used), Seconds(t - t[0], start, f"{read[date].note}; {note}", "date and time"), 2
+
+
+def _named_parts(sheet: Sheet) -> dict[str, str]:
+    """Return the columns that are parts of a date or time, by part; `mm` behind an hour is its minute."""
+    at: dict[str, str] = {}
+    for n in sheet.columns:
+        word = n.strip().lower()
+        keys = [key for key, names in _FIELDS.items() if word in names]
+        at |= dict.fromkeys(["minute"] if word == "mm" and "hour" in at else keys, n)
+    return at
+
+
+def _of_day(sheet: Sheet, at: dict[str, str]) -> tuple[tuple[str, ...], np.ndarray] | None:
+    """Return columns hour, minute and perhaps second, and their seconds of the day (N,)."""
+    used = [key for key in ("hour", "minute", "second") if key in at]
+    whole = all(_within(sheet.columns[at[k]], *_RANGES[k]) for k in used)
+    if used[:2] != ["hour", "minute"] or not whole or {"month", "day", "doy"} & at.keys():
+        return None
+    since = np.zeros(len(sheet))
+    for key, seconds in zip(used, (clock.HOUR_S, 60.0, 1.0), strict=False):
+        if key != "second" and np.any(sheet.columns[at[key]] % 1):
+            return None
+        since += sheet.columns[at[key]] * seconds
+    return tuple(at[key] for key in used), since
 
 
 def _of_first_columns(sheet: Sheet) -> tuple[tuple[str, ...], Seconds] | None:
@@ -100,6 +133,8 @@ def _of_parts(sheet: Sheet, at: dict[str, str]) -> tuple[tuple[str, ...], Second
         if not isinstance(c, np.ndarray) or not np.isfinite(c).all() or (key != "second" and np.any(c % 1)):
             return None
     whole = {key: c.astype(np.int64) for key, c in columns.items() if key != "second"}
+    if "year" in whole and whole["year"].max() < 100:
+        whole["year"] += 2000
     if yearless:  # a typical year
         whole["year"] = np.full(len(sheet), 2001)
     days = clock.days(whole["year"], whole.get("month", 1), whole["day" if "month" in at else "doy"])
