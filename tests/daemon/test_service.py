@@ -90,6 +90,31 @@ def test_stop_leaves_the_rig_of_another_configuration_alone(daemon, unrecorded, 
     assert daemon.ask("status")["state"] == "ARMED"
 
 
+def test_two_operators_start_one_rig(unrecorded):
+    """The second one was told that the daemon did not start, below a line of the first one's log."""
+
+    def command(word):
+        return subprocess.Popen(
+            [sys.executable, "-m", "thermoctl.cli", word, "--config", str(unrecorded)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT}/hal"},
+        )
+
+    both = [command("start"), command("start")]
+    said = sorted(p.communicate(timeout=90)[0] for p in both)
+    assert [p.returncode for p in both] == [0, 0], said
+    assert said[0].startswith("already running (pid ") and said[1].startswith("started (pid "), said
+    ends = command("stop")
+    while (
+        lock.holder(load_settings(unrecorded)) and service._state(load_settings(unrecorded)) != service.SILENT
+    ):
+        assert ends.poll() is None or lock.holder(load_settings(unrecorded)) is None
+    begins = command("start")  # while the old daemon still ends
+    assert ends.wait(60) == 0 and begins.communicate(timeout=90)[0].startswith("started (pid ")
+
+
 def test_start_gives_the_daemons_own_error(unrecorded, capsys):
     text = unrecorded.read_text()
     unrecorded.write_text(re.sub(r"plant: \S+", "plant: gone.yaml", text))

@@ -28,6 +28,8 @@ from thermoctl.interrupt import held
 
 START_S = 90.0  # as TimeoutStartSec= of the unit: devices connect before the first tick
 STOP_S = 30.0  # the supervisor gives its processes 3 and 10 s before it kills them
+ENDS_S = 15.0  # longest time in which a daemon that does not answer comes up or ends
+SILENT = "it does not answer"
 SOURCE = shipped("systemd")
 UNITS = "etc/systemd/system"
 FIRST = "thermoctl.service"  # the unit of the first rig; further ones are thermoctl-RIG.service
@@ -89,8 +91,7 @@ def start(settings: Settings) -> int:
     """Start the daemon, by its unit where one runs this configuration, and wait until it takes commands.
 
     Returns 0, or 3 with the daemon's own error. A signal meanwhile ends the daemon, too."""
-    if (pid := holder(settings)) is not None:
-        print(f"already running (pid {pid}, {_state(settings)})")
+    if _runs(settings):
         return 0
     unit, process = _unit_for(settings), None
     if unit and _systemctl("start", unit):
@@ -105,10 +106,23 @@ def start(settings: Settings) -> int:
         if _is_up(settings, process, log):
             unless_up.pop_all()
             return 0
+    if process is not None and process.poll() is not None and _runs(settings):
+        return 0  # somebody else's start was first
     if process is not None:
         sys.stderr.write(process.said())
     print(f"thermoctl: the daemon did not start; its log: {log}", file=sys.stderr)
     return 3
+
+
+def _runs(settings: Settings) -> bool:
+    """Return whether somebody holds the rig, and say so. One that does not answer begins or ends: wait."""
+    deadline = time.monotonic() + ENDS_S
+    while (pid := holder(settings)) is not None:
+        if (state := _state(settings)) != SILENT or time.monotonic() > deadline:
+            print(f"already running (pid {pid}, {state})")
+            return True
+        time.sleep(0.1)
+    return False
 
 
 def _is_up(settings: Settings, process: Background | None, log: str) -> bool:
@@ -130,7 +144,7 @@ def _state(settings: Settings) -> str:
     try:
         return ", ".join(ask(p.socket.path, {"command": "status"})["state"] for p in settings.parts)
     except InputError:
-        return "it does not answer"
+        return SILENT
 
 
 def stop(settings: Settings) -> int:
