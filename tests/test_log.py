@@ -55,6 +55,28 @@ def test_a_full_disk_ends_nothing_and_is_reported_afterwards():
     assert "2 lines are lost" in lost and "tick=9" in line
 
 
+def test_a_pipe_that_nobody_reads_holds_nobody_up():
+    """The process that answers commands waited in its log: an armed rig could not be disarmed."""
+    code = """
+import os, time
+from thermoctl.log import console_log
+keep, (end, begin) = os.dup(2), os.pipe()
+os.dup2(begin, 2)
+start_s = time.monotonic()
+for k in range(2000):
+    console_log("state", tick=k, text=5000 * "x" if k % 9 == 0 else None)
+assert time.monotonic() - start_s < 5.0
+os.set_blocking(end, False)
+first = os.read(end, 1 << 20)
+console_log("state", tick=2000)
+said = os.read(end, 1 << 20).decode().splitlines()
+os.dup2(keep, 2)
+assert first.startswith(b"20") and b"tick=1 " not in first[:100], first[:100]
+assert "lines are lost" in said[-2] and said[-1].endswith("state tick=2000"), said
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_what_libraries_and_threads_say_are_events_too():
     code = """
 import logging, threading, warnings

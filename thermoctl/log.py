@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import select
 import sys
 import threading
 import traceback
@@ -19,6 +20,7 @@ from typing import Any
 import structlog
 
 _bound: dict[str, Any] = {}
+WAIT_S = 0.1
 _LAST = ("rig", "axis", "run")  # fields at a line's end
 
 
@@ -92,6 +94,18 @@ class _Stderr:
     lost = 0
     torn = False
 
+    def _write(self, data: bytes) -> None:
+        """Write on stderr; raise BlockingIOError where a pipe or a terminal takes nothing for WAIT_S.
+
+        Nobody reads it, or Ctrl-S stopped it: a command such as disarm would wait for this line."""
+        wait_s = 0.0 if self.lost else WAIT_S
+        for at in range(0, len(data), select.PIPE_BUF):
+            if not select.select([], [2], [], wait_s)[1]:
+                raise BlockingIOError
+            part = data[at : at + select.PIPE_BUF]
+            done = os.write(2, part)
+            self.torn = at + done < len(data)
+
     def info(self, line: str) -> None:
         """Write one line."""
         head = "\n" if self.torn else ""
@@ -101,8 +115,7 @@ class _Stderr:
         data = f"{head}{line}\n".encode(errors="backslashreplace")
         try:
             if sys.stderr is sys.__stderr__:
-                done = os.write(2, data)
-                self.torn = done < len(data)
+                self._write(data)
             else:  # replaced, in a test or a notebook
                 sys.stderr.write(data.decode())
             self.lost = 0

@@ -323,6 +323,33 @@ def test_setpoint_flood_by_the_socket(daemon):
     say("setpoint flood: four clients", "2 s", f"disarmed in {seconds * 1e3:.0f} ms", "disarmed", "")
 
 
+def test_a_log_that_nobody_reads(tmp_path):
+    """`thermoctl run` into a pipe, or in a terminal that Ctrl-S stopped: a disarm was never answered."""
+    os.mkfifo(tmp_path / "rig.log")
+    unread = os.open(tmp_path / "rig.log", os.O_RDWR)
+    daemon = start(tmp_path, tmp_path / "recordings")
+    try:
+        for _ in range(200):
+            daemon.ask("arm")
+            daemon.ask("disarm")
+        daemon.armed()
+        begin = time.monotonic()
+        assert daemon.ask("disarm")["ok"]
+        seconds = time.monotonic() - begin
+        assert daemon.ask("status")["state"] == "READY" and seconds < 2.0
+        assert daemon.stop() == 0
+    finally:
+        daemon.kill()
+        os.close(unread)
+    say(
+        "log: a pipe that nobody reads, or a stopped terminal",
+        "2 s",
+        f"disarmed in {seconds * 1e3:.0f} ms",
+        "drives on",
+        "`the log could not be written, N lines are lost` when it can be again",
+    )
+
+
 def test_two_daemons(daemon, tmp_path):
     second = subprocess.run(
         [sys.executable, "-m", "thermoctl.cli", "run", "--config", str(daemon.config)],
