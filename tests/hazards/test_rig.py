@@ -86,6 +86,21 @@ def test_blocked_stage(rig):
     finish(rig, "following error: blocked stage", 400, ticks, found, way)
 
 
+@pytest.mark.parametrize("setpoint_um", [-240.0, 200.0, 240.0])
+def test_a_disarm_far_from_rest_is_no_fault(rig, setpoint_um):
+    """The stage that sprang back was told as position_disagrees, and nobody could arm meanwhile."""
+    rig.arm()
+    rig.command("setpoint", setpoint_um)
+    rig.tick(16_000)  # at 1 mm a minute
+    assert rig.state == "ARMED" and abs(rig["compensated_um"] - setpoint_um) < 1.0
+    rig.command("disarm")
+    seen = set()
+    for _ in range(1000):
+        rig.tick()
+        seen |= rig.faults
+    assert rig.state == "READY" and not seen
+
+
 def test_over_temperature_by_rate(quick):
     """A coil that heats ten times faster than it may trips long before its limit of temperature."""
     p = dataclasses.replace(law_parameters(quick), coil_rate_k_s=0.5, coil_rate_time_s=3.0)

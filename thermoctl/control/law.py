@@ -820,8 +820,11 @@ class Law:
             if abs(self.current_error_a) > self.p.current_tolerance_a:
                 self.faults |= one << _B_NOT_FOLLOWING
         if current and self.verdict[_POSITION] == 0.0 and self.p.flexure_um_per_a != 0.0:
+            before_um = abs(self.position_apart_um)
             self._compare_position(self.last[_POSITION], self.p.flexure_um_per_a * amperes)
-            self.displaced_um += part * (self.position_apart_um - self.displaced_um)
+            # A stage that was switched off far from its rest comes back by itself.
+            if self.state == _ARMED or abs(self.position_apart_um) >= before_um:
+                self.displaced_um += part * (self.position_apart_um - self.displaced_um)
             if abs(self.displaced_um) > self.p.position_tolerance_um:
                 self.faults |= one << _B_DISPLACED
         if self.corrected == 0.0:
