@@ -3,6 +3,7 @@
 import pytest
 
 from thermoctl import cli
+from thermoctl.cli import command_line
 from thermoctl.configuration import which_rig
 from thermoctl.files.shipped import COPIED, shipped
 from thermoctl.files.yamlfile import InputError
@@ -44,7 +45,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def parsed(command, *more):
-    return cli.parser().parse_args([command, *COMMANDS[command], *more])
+    return command_line.parser().parse_args([command, *COMMANDS[command], *more])
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -96,7 +97,7 @@ def test_commands_that_need_no_rig_ask_for_none(folder):
         ["experiment", "next.yaml", "--dry-run"],
         ["service", "uninstall"],
     ):
-        which_rig.choose(cli.parser().parse_args(line))
+        which_rig.choose(command_line.parser().parse_args(line))
 
 
 def test_init_copies_what_a_start_needs_and_keeps_what_is_there(folder, capsys):

@@ -15,6 +15,7 @@ from tests.daemon.process import ROOT, Daemon, patient, wait
 from tests.plants import HEATED_BLOCK, HEATED_RADIATES
 from tests.simulated import rig_file
 from thermoctl import cli
+from thermoctl.cli import command_line
 from thermoctl.configuration.which_rig import ACTING
 from thermoctl.daemon import lock
 from thermoctl.plant import load
@@ -171,4 +172,4 @@ def test_a_command_that_is_meant_is_refused_where_the_table_says_so(foreign, cap
 def test_every_command_of_the_table_is_tried_and_exists():
     assert set(BESIDE) == {act.command for act in ACTS} == ACTING
     for act in ACTS:
-        cli.parser().parse_args([act.command, *BESIDE[act.command][0]])
+        command_line.parser().parse_args([act.command, *BESIDE[act.command][0]])
