@@ -180,8 +180,8 @@ class Commands:
     def let_go(self, peer: str) -> None:
         """Disarm after the connection that armed the rig has ended, for whatever reason."""
         if self._state() == "ARMED":
-            self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
             self._send(arming.DISARM)
+            self.log("command", name="disarm", peer=peer, ok=True, why="its connection is gone")
         self._give_up_trial()
 
     def _give_up_trial(self) -> None:
