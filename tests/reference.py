@@ -79,7 +79,8 @@ def configuration() -> str:
     text = (
         _HEAD + "# Configuration\n\nOne YAML file describes a rig. `thermoctl check FILE` says whether it is "
         "right; `thermoctl reload` applies the options that need no restart between two ticks. In steps: while ARMED "
-        f"a reload changes it by a factor of {LIVE_STEP:g} at most, so that the output does not jump.\n"
+        f"a reload changes it by a factor of {LIVE_STEP:g} at most, so that the output does not jump. An option in "
+        "force that the file has no longer refuses the reload.\n"
     )
     for section, cls in SECTIONS.items():
         rows = [
