@@ -15,7 +15,7 @@ from tests.plants import WIDE_BLOCK
 from thermoctl.diagnosis.data.case import Budget, case
 from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.evidence.fit import fitted
-from thermoctl.diagnosis.evidence.held_out import worse, worth
+from thermoctl.diagnosis.evidence.held_out import Worth, worse, worth
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report import notes
@@ -114,13 +114,13 @@ def test_the_start_of_a_swing_is_fitted_before_its_error_is_measured(reserve):
 )
 def test_a_recording_set_aside_that_is_not_followed_is_told_where_nothing_is_missing(own, why):
     """A patient with a volume of his own: 'consistent' stood beside an error of 3.8 times the noise, without a word."""
-    worth = SimpleNamespace(noise={"y": 0.6}, refit_only={"y": 2.3}, reserved=True, names=("pat_5",))
+    worth = Worth({}, {"y": 2.3}, {}, reserved=True, names=("pat_5",), noise={"y": 0.6})
     volume = SimpleNamespace(per_recording=own, range=(1.0, 9.0))
     case = SimpleNamespace(plant=SimpleNamespace(parameters={"V": volume}))
     d = SimpleNamespace(worth=worth, case=case, decision=SimpleNamespace(verdict="consistent"))
     (note,) = notes._differ(d)
     assert note == f"the error of y is 3.8 times the noise in pat_5, set aside: {why}"
-    worth.refit_only = {"y": 0.7}
+    d.worth = replace(worth, refit_only={"y": 0.7})
     assert not notes._differ(d)
 
 

@@ -29,7 +29,13 @@ def found(factors, parameter="C"):
 
 @pytest.mark.parametrize(
     ("factors", "when"),
-    [((1, 1.2), "from day_2 on"), ((1, 1.2, 1, 1), "in day_2"), ((1, 1.2, 1.2, 1.2), "from day_2 on")],
+    [
+        ((1, 1.2), "from day_2 on"),
+        ((1, 1.2, 1), "in day_2"),
+        ((1, 1, 1.2), "from day_3 on"),
+        ((1, 1.2, 1, 1), "in day_2"),
+        ((1, 1.2, 1.2, 1.2), "from day_2 on"),
+    ],
 )
 def test_a_load_that_differs_is_named_with_its_recording(factors, when):
     result = found(factors)

@@ -17,7 +17,7 @@ from thermoctl.diagnosis.evidence.held_out import cleaned, split, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.steady import steady
 from thermoctl.diagnosis.evidence.unknown import left, reached
-from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
+from thermoctl.diagnosis.hypothesis.candidates import DIFFERS, Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
@@ -83,8 +83,18 @@ def diagnose(
 
 
 def undecided(found: Diagnosis, held_out: Sequence[Any]) -> bool:
-    """Return whether a recording that nobody wanted aside may tell what the others cannot."""
-    return found.decision.verdict == "ambiguous" and found.worth.reserved and not held_out
+    """Return whether a recording that nobody wanted aside may tell what the others cannot.
+
+    So it may where it is not followed though nothing is missing in the others, and where it does not confirm
+    that a parameter differs between the others: it may have a value of its own."""
+    if held_out or not found.worth.reserved:
+        return False
+    likeliest = next(iter(found.posterior.hypotheses))
+    entries = [found.case.catalogue.get(e) for e, _ in likeliest]
+    differs = any(e.where == DIFFERS for e in entries if e)
+    return {"ambiguous": True, "unexplained": differs, "consistent": bool(found.worth.not_followed)}.get(
+        found.decision.verdict, False
+    )
 
 
 def sought(

@@ -22,6 +22,7 @@ ENOUGH = 3  # from this number of recordings on, the last one is set aside
 # Blocks of a recording; with too few recordings, every other block is fitted and the rest checked.
 BLOCKS = 16
 STEPS = 2  # largest number of steps from the refit of all blocks to that of half of them
+APART = 2.0  # ratio of an error on recordings set aside to the noise, from which it is no noise
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,12 @@ class Worth:
     worse: float = 0.0
     tables: tuple[Table, ...] = ()
     errors: Mapping[str, Sequence[np.ndarray]] = field(default_factory=dict)
+
+    @property
+    def not_followed(self) -> dict[str, float]:
+        """Errors of a refit on recordings set aside that are far above the noise, by output, over it."""
+        over = {o: rms / self.noise[o] for o, rms in self.refit_only.items()}
+        return {o: ratio for o, ratio in over.items() if self.reserved and ratio > APART}
 
     @property
     def share_closed(self) -> float | None:

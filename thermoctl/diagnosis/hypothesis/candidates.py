@@ -15,6 +15,7 @@ from thermoctl.plant.expression import Expr, name
 Key = tuple[str, str]  # (effect, where)
 Keys = frozenset[Key]  # the effects of a hypothesis
 EVENTS = {"onsets", "windows"}  # shapes that happen at one moment
+DIFFERS = "free_parameter"  # the place of what differs between recordings
 FAR = 5.0  # durations of a recording between it and one that begins before or after an event
 
 
@@ -78,8 +79,8 @@ def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
     """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
 
     The event is at the same time of each, or at a time of one that it changes alone or with later ones.
-    What differs between recordings does so in one, or from one on: not in all."""
-    differs = effect.where == "free_parameter"
+    A parameter that differs between recordings does so in one, or from one on: not in all."""
+    differs = effect.where == DIFFERS
     clocks: dict[str, dict[str, float]] = {} if differs else {"": {}}
     names = [d.name for d in rig.drives]
     in_pieces = any(d.x0 is not None for d in rig.drives)

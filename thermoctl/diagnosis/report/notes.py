@@ -21,7 +21,6 @@ from thermoctl.plant.fitting.refit import Fit
 MOVES = 6.0  # an output moves if its spread is this many standard deviations of its noise
 # Largest residual variance over the output's, if the plant is of this rig and lacks some physics.
 FOLLOWS = 0.3
-APART = 2.0  # ratio of an error on recordings set aside to the noise, from which it is noted
 MATTERS = 0.1  # nats by which a refit is below its maximum, from which a probability changes
 
 
@@ -60,9 +59,8 @@ def _differ(d: Diagnosis) -> list[str]:
     """Return a sentence where recordings set aside are not followed, though nothing is missing in the others.
 
     A recording has values of its own of the parameters that the plant file frees for each."""
-    noise, aside = d.worth.noise, d.worth.refit_only
-    over = {o: rms / noise[o] for o, rms in aside.items() if rms > APART * noise[o]}
-    if d.decision.verdict != "consistent" or not d.worth.reserved or not over:
+    over = d.worth.not_followed
+    if d.decision.verdict != "consistent" or not over:
         return []
     own = [q for q, p in d.case.plant.parameters.items() if p.per_recording and p.range]
     why = (

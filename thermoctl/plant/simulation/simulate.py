@@ -302,12 +302,15 @@ class Model:
 
     def _signals(self, excitation: Excitation, p: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray | float]:
         u = self._delayed_inputs(excitation, p)
-        return {
+        values = {
             **dict(zip(self.code.inputs, u.T, strict=True)),
             **dict(zip(self.parameters, p, strict=True)),
             **dict(zip(self.states, x.T, strict=True)),
             "t": excitation.t,
         }
+        # what a delayed signal of an output visits, it visits without the delay
+        undelayed = {k: ex.evaluate(signal, values) for k, (signal, _) in self.code.output_delays.items()}
+        return values | undelayed
 
     def run(
         self,
