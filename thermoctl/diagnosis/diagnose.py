@@ -85,8 +85,8 @@ def diagnose(
 def undecided(found: Diagnosis, held_out: Sequence[Any]) -> bool:
     """Return whether a recording that nobody wanted aside may tell what the others cannot.
 
-    So it may where it is not followed though nothing is missing in the others, and where it does not confirm
-    that a parameter differs between the others: it may have a value of its own."""
+    It may have a value of its own of a parameter that differs between the others. Nor is it followed where
+    only there something is missing."""
     if held_out or not found.worth.reserved:
         return False
     likeliest = next(iter(found.posterior.hypotheses))

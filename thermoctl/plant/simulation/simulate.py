@@ -308,7 +308,7 @@ class Model:
             **dict(zip(self.states, x.T, strict=True)),
             "t": excitation.t,
         }
-        # what a delayed signal of an output visits, it visits without the delay
+        # without its delay a signal visits the same values
         undelayed = {k: ex.evaluate(signal, values) for k, (signal, _) in self.code.output_delays.items()}
         return values | undelayed
 
