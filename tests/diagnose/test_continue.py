@@ -10,7 +10,7 @@ import pytest
 from tests.plants import ONE_BLOCK
 from thermoctl.diagnosis.run import diagnose
 from thermoctl.files.yamlfile import InputError
-from thermoctl.plant import load
+from thermoctl.plant import load, loads
 from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
@@ -124,8 +124,9 @@ def test_an_event_of_an_earlier_recording_lasts_in_a_new_one(tmp_path):
     path.write_text(
         ONE_BLOCK.replace("flows:\n", "flows:\n  opened: {from: block, rate: 0.05 * (block - air)}\n")
     )
+    late = loads(path.read_text().replace("rate: 0.05", "rate: 0.05 * step(t - 90)"))
     rng, tables = np.random.default_rng(4), []
-    for day, true in enumerate((plant, load(path), load(path))):
+    for day, true in enumerate((plant, late, load(path))):
         heat = 4.0 * rng.integers(0, 2, 8)[(t // 50).astype(int)]
         table = Table(f"day_{day}", f"day_{day}", t, {"heat": heat, "air": 20 + 0 * t})
         tables.append(compile_plant(true).measure(table, seed=day))

@@ -35,7 +35,7 @@ flows:
   damper: {from: speed, rate: D * speed, unit: N}
 outputs: {reading: {value: speed, unit: m/s, noise: 0.01}}
 """
-AMBIENT = {"G": 0.05, "B0": 24.0, "B1": 25.0, "B2": 24.5, "B3": 23.0, "B4": 22.5}
+AMBIENT = {"G": 0.05, "B": 24.0, "D": -1.5, "S1": 1.2, "S2": 0.6, "S3": 0.1, "S4": 0.1}
 PROBLEMS = {
     "linear": (HEATER, None, None, 0.0),
     "gain": (HEATER, "sensor_gain", {"A": 1.03}, 0.0),
@@ -131,7 +131,7 @@ def test_a_delay_has_a_size_whatever_the_range_in_which_it_is_looked_for():
 
 
 def test_a_prior_of_the_catalogue_is_a_density():
-    """Without its normalisation an unknown ambient lost 12 nats a recording: five values count as nothing else."""
+    """Without its normalisation an unknown ambient lost 12 nats a recording: six values count as nothing else."""
     plant = loads(HEATER)
     t = np.arange(0.0, 1800.0, 6.0)
     inputs = {"heat": np.full(len(t), 3.0), "air": np.full(len(t), 21.0)}
@@ -151,10 +151,12 @@ def test_a_prior_of_the_catalogue_is_a_density():
     density -= log_density(alone, z[others], {})
     scale = {p: posterior.problem.scales[q] for p, q in extended[1].items()}
     values = {p: scale[p].value(z[names.index(q)]) for p, q in extended[1].items()}
-    walk = float(np.sqrt(9 * t[-1] / 4 / 3600))  # 3 K in an hour
-    steps = np.diff([values[f"B{k}"] for k in range(5)])
-    expected = norm(21.0, 10.0).logpdf(values["B0"]) + norm(0.0, walk).logpdf(steps).sum()
-    expected += sum(np.log(scale[f"B{k}"].slope(z[names.index(extended[1][f"B{k}"])])) for k in range(5))
+    walk = float(np.sqrt(9 * t[-1] / 3600))  # 3 K in an hour
+    expected = norm(21.0, 10.0).logpdf(values["B"]) + norm(0.0, walk).logpdf(values["D"])
+    waves = ((k, values[f"S{k}"]) for k in range(1, 5))  # of a Brownian bridge
+    expected += sum(norm(0.0, walk * np.sqrt(2) / (k * np.pi)).logpdf(v) for k, v in waves)
+    course = values.keys() - {"G"}
+    expected += sum(np.log(scale[p].slope(z[names.index(extended[1][p])])) for p in course)
     size = -np.log(np.log(10.0) * 4.0 * np.hypot(values["G"], 0.01))  # log-uniform over four decades
     size += np.log(scale["G"].slope(z[names.index(extended[1]["G"])]))
     assert density == pytest.approx(expected + size, abs=0.02)

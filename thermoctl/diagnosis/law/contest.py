@@ -16,7 +16,7 @@ from thermoctl.diagnosis.data.case import FAILS, Case
 from thermoctl.diagnosis.evidence.fit import Fitted, Placed, placed_at
 from thermoctl.diagnosis.evidence.levels import only_noise
 from thermoctl.diagnosis.evidence.posterior import Hypothesis
-from thermoctl.diagnosis.hypothesis.candidates import Keys
+from thermoctl.diagnosis.hypothesis.candidates import DIFFERS, Keys
 from thermoctl.diagnosis.hypothesis.places import Place
 from thermoctl.diagnosis.law.find import Goal, refits
 from thermoctl.diagnosis.law.forms import LAW
@@ -38,7 +38,7 @@ def with_laws(s: Search) -> Search:
     effects = len(best.fitted.hypothesis.effects)
     if only_noise(case, best.fitted) and effects < PAIR and (not effects or not _pays(case, best)):
         return s
-    queue, known = [alone, best, *_beside_bounded(s, best)], set[Keys]()
+    queue, known = [alone, best, *_beside_bounded(s, best), _the_same(s)], set[Keys]()
     while queue and not case.budget.stopped():
         parent, *queue = queue
         keys = parent.fitted.hypothesis.keys
@@ -103,6 +103,18 @@ def _beside_bounded(s: Search, best: Weighed) -> list[Weighed]:
     keys, bounds = best.fitted.hypothesis.keys, best.fitted.fit.at_bound.keys()
     bounded = [e.key for e in best.fitted.hypothesis.effects if bounds & {*e.own.values()}]
     return [s.tried[keys - {key}] for key in bounded if keys - {key} in s.tried]
+
+
+def _the_same(s: Search) -> Weighed:
+    """Return the likeliest hypothesis in which no parameter differs between recordings.
+
+    A parameter that differs may stand for a law: beside it the law is not seen."""
+    same = (
+        w
+        for w in s.tried.values()
+        if all(e.candidate.effect.where != DIFFERS for e in w.fitted.hypothesis.effects)
+    )
+    return max(same, key=lambda w: w.score)
 
 
 def _without_laws(s: Search) -> list[Weighed]:
