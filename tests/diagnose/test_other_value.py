@@ -11,12 +11,13 @@ from thermoctl.diagnosis.diagnose import diagnose
 from thermoctl.diagnosis.hypothesis.catalogue import catalogue
 from thermoctl.diagnosis.limits import limits
 from thermoctl.diagnosis.report import words as text
-from thermoctl.plant import loads
+from thermoctl.diagnosis.run import diagnose as diagnosed
+from thermoctl.plant import load, loads
 from thermoctl.plant.simulation.simulate import compile_plant
 
 
-def found(factors, parameter="C"):
-    """The result of diagnosing recordings of a block whose parameter is multiplied by each factor in turn."""
+def days(factors, parameter="C"):
+    """Recordings of a block whose parameter is multiplied by each factor in turn."""
     plant, tables = loads(ONE_BLOCK), []
     for k, factor in enumerate(factors):
         p = plant.parameters[parameter]
@@ -24,7 +25,12 @@ def found(factors, parameter="C"):
         real = dataclasses.replace(plant, parameters={**plant.parameters, parameter: changed})
         table = compile_plant(real).measure(inputs("one block"), 3 + k)
         tables.append(dataclasses.replace(table, name=f"day_{k + 1}"))
-    return contract(diagnose(plant, tables, catalogue(), limits()))
+    return tables
+
+
+def found(factors):
+    """The result of diagnosing such recordings with the plant of the first one."""
+    return contract(diagnose(loads(ONE_BLOCK), days(factors), catalogue(), limits()))
 
 
 @pytest.mark.parametrize(
@@ -45,6 +51,17 @@ def test_a_load_that_differs_is_named_with_its_recording(factors, when):
     assert a["value"] == pytest.approx(0.2, abs=4 * a["sd"]) and a["sd"] < 0.02
     assert f"other value {when} at C" in text.words(result)
     assert any("per_recording: true" in note for note in result["notes"])
+
+
+def test_a_value_of_earlier_recordings_lasts_in_a_new_one(tmp_path):
+    """A new recording alone has no other one to differ from: the hypothesis was lost with its evidence."""
+    (tmp_path / "plant.yaml").write_text(ONE_BLOCK)
+    plant, tables = load(tmp_path / "plant.yaml"), days((1, 1.2, 1.2))
+    first = diagnosed(plant, tables[:2], tmp_path / "0")
+    then = diagnosed(plant, tables[2:], tmp_path / "1", earlier=tmp_path / "0")
+    sizes = [next(iter(r["findings"][0]["parameters"].values())) for r in (first, then)]
+    assert then["findings"][0]["effect"] == "other_value" and sizes[1]["sd"] < sizes[0]["sd"]
+    assert sizes[1]["value"] == pytest.approx(0.2, abs=4 * sizes[1]["sd"])
 
 
 def test_recordings_of_one_rig_have_no_other_value():

@@ -54,13 +54,15 @@ def _placed(rig: Rig, effect: Effect) -> Iterator[tuple[Place, Effect]]:
             yield place, here
 
 
-def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
-    """Return every effect at every place where it can act, with every choice of the signals it needs."""
+def candidates(rig: Rig, effects: Mapping[str, Effect], again: bool = False) -> list[Candidate]:
+    """Return every effect at every place where it can act, with every choice of the signals it needs.
+
+    `again`: also those that only earlier recordings can show."""
     out = []
     for effect in effects.values():
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
-        clocks = _clocks(rig, effect)
+        clocks = _clocks(rig, effect, again)
         for place, here in _placed(rig, effect):
             for variant, changes in enumerate(effect.changes):
                 if any("recorded" in c for c in changes) and not place.input:
@@ -75,13 +77,13 @@ def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
     return out
 
 
-def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
+def _clocks(rig: Rig, effect: Effect, again: bool) -> dict[str, dict[str, float]]:
     """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
 
     The event is at the same time of each, or at a time of one that it changes alone or with later ones.
     A parameter that differs between recordings does so in one, or from one on: not in all."""
     differs = effect.where == DIFFERS
-    clocks: dict[str, dict[str, float]] = {} if differs else {"": {}}
+    clocks: dict[str, dict[str, float]] = {} if differs and not again else {"": {}}
     names = [d.name for d in rig.drives]
     in_pieces = any(d.x0 is not None for d in rig.drives)
     if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()) and not differs:
