@@ -162,7 +162,7 @@ def test_a_reload_takes_no_limit_away(daemon):
         daemon.config.write_text(text.replace(f"  {line}\n", "", 1).replace(f"  {line} ", "  # ", 1))
         answer = daemon.ask("reload")
         assert not answer["ok"] and f"{line.split(':')[0]}: in force, and no longer in" in answer["error"]
-    daemon.config.write_text(text.replace("stale_s: {position_um: 5}", "stale_s: {}"))
+    daemon.config.write_text(text.replace("stale_s: {position_um: 0.01, ", "stale_s: {"))
     assert "protection.stale_s.position_um: in force" in daemon.ask("reload")["error"]
     daemon.config.write_text(text.replace("coil_limit_c: 80", "coil_limit_c: 85"))
     assert daemon.ask("reload")["applied"] == ["protection.coil_limit_c"]
