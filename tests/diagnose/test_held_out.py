@@ -109,17 +109,12 @@ def test_the_start_of_a_swing_is_fitted_before_its_error_is_measured(reserve):
     assert found.after["angle"] == pytest.approx(0.007, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("own", "why"), [(True, "V is not fitted there"), (False, "they differ from the others")]
-)
-def test_a_recording_set_aside_that_is_not_followed_is_told_where_nothing_is_missing(own, why):
+def test_a_recording_set_aside_that_is_not_followed_is_told_where_nothing_is_missing():
     """A patient with a volume of his own: 'consistent' stood beside an error of 3.8 times the noise, without a word."""
     worth = Worth({}, {"y": 2.3}, {}, reserved=True, names=("pat_5",), noise={"y": 0.6})
-    volume = SimpleNamespace(per_recording=own, range=(1.0, 9.0))
-    case = SimpleNamespace(plant=SimpleNamespace(parameters={"V": volume}))
-    d = SimpleNamespace(worth=worth, case=case, decision=SimpleNamespace(verdict="consistent"))
+    d = SimpleNamespace(worth=worth, decision=SimpleNamespace(verdict="consistent"))
     (note,) = notes._differ(d)
-    assert note == f"the error of y is 3.8 times the noise in pat_5, set aside: {why}"
+    assert note == "the error of y is 3.8 times the noise in pat_5, set aside, which differs from the others"
     d.worth = replace(worth, refit_only={"y": 0.7})
     assert not notes._differ(d)
 

@@ -23,6 +23,7 @@ from thermoctl.diagnosis.verdict.misfit import standouts
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
 
+SHOWS = 2.0  # standard deviations from the first recording, from which a value differs there
 MISFIT = 1.1  # residual rms over the stated noise, from which an output is listed under `mismatch`
 UNCONFIRMED = "nothing else confirms it"  # it helps in the part that it is fitted to, and not in others
 CONTRADICTED = "recordings set aside contradict it"  # with it they are predicted worse
@@ -114,9 +115,17 @@ def _finding(d: Diagnosis, e: Placed) -> dict[str, Any]:
     figures = ", ".join(f"{n} = {p.value:.4g} {p.unit or ''}".strip() for n, p in values.items())
     family, begins = d.of_family.get(e.key), e.candidate.begins
     own = next((r for r, v in begins.items() if v == 0.0), None)
+    here = [
+        r
+        for p in values.values()
+        if p.known
+        for r, v in p.values.items()
+        if abs(v) > SHOWS * d.best.sd[p.name]
+    ]
     return {
         "effect": e.key[0],
         "where": e.key[1],
+        **({"differs_in": here} if here else {}),
         "when": None if first is None else [[first, min(ends.get("end", last), last)]],
         "recording": own,
         "lasts": max(begins.values()) > 0 if own else None,

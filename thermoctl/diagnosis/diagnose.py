@@ -13,11 +13,11 @@ from thermoctl.diagnosis.data.memory import NOTHING, Memory
 from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.evidence.fit import closest, with_residuals
-from thermoctl.diagnosis.evidence.held_out import cleaned, split, worth
+from thermoctl.diagnosis.evidence.held_out import cleaned, split, with_values_aside, worth
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.steady import steady
 from thermoctl.diagnosis.evidence.unknown import left, reached
-from thermoctl.diagnosis.hypothesis.candidates import DIFFERS, Key, Keys
+from thermoctl.diagnosis.hypothesis.candidates import Key, Keys
 from thermoctl.diagnosis.hypothesis.catalogue import contained
 from thermoctl.diagnosis.hypothesis.effect import Effect
 from thermoctl.diagnosis.law.contest import with_laws
@@ -85,16 +85,11 @@ def diagnose(
 def undecided(found: Diagnosis, held_out: Sequence[Any]) -> bool:
     """Return whether a recording that nobody wanted aside may tell what the others cannot.
 
-    It may have a value of its own of a parameter that differs between the others. Nor is it followed where
-    only there something is missing."""
+    Where only there something is missing, it is not followed."""
     if held_out or not found.worth.reserved:
         return False
-    likeliest = next(iter(found.posterior.hypotheses))
-    entries = [found.case.catalogue.get(e) for e, _ in likeliest]
-    differs = any(e.where == DIFFERS for e in entries if e)
-    return {"ambiguous": True, "unexplained": differs, "consistent": bool(found.worth.not_followed)}.get(
-        found.decision.verdict, False
-    )
+    verdict = found.decision.verdict
+    return verdict == "ambiguous" or verdict == "consistent" and bool(found.worth.not_followed)
 
 
 def sought(
@@ -166,7 +161,8 @@ def decided(sought: Sought) -> Diagnosis:
     null = best = with_residuals(known, closest(known, tried[frozenset()].fitted))
     if chosen:
         best = with_residuals(known, closest(known, tried[chosen].fitted))
-        best = replace(best, sd=deviations(best, energy, numbers))
+        plant = with_values_aside(known, best.plant, reserve)
+        best = replace(best, plant=plant, sd=deviations(best, energy, numbers))
     reach = reached(known)
     after, before = left(known, best, reach), left(known, null, reach)
     value = worth(known, null, best, sought.reserve)

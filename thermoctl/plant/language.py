@@ -80,7 +80,9 @@ class Input:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter; `range`: bounds of a refit (None: known); `values`: per recording."""
+    """A parameter; `range`: bounds of a refit (None: known); `values`: per recording.
+
+    `known`: recordings in which a refit does not move it."""
 
     name: str
     value: float
@@ -89,6 +91,7 @@ class Parameter:
     per_recording: bool = False
     values: Mapping[str, float] = field(default_factory=dict)
     at: str = _place()
+    known: tuple[str, ...] = ()
 
     def value_in(self, recording: str) -> float:
         """Return its value in a recording, or in a part of one after a gap (`run_1_part2`)."""

@@ -148,7 +148,7 @@ class Case:
 
     def rig(self, plant: Plant, drives: Sequence[Excitation]) -> Rig:
         """Return the parts and signals of a plant, with these recordings."""
-        return Rig(plant, drives, [t.columns for t in self.tables])
+        return Rig(plant, drives, [t.columns for t in self.tables], bool(self.memory.hypotheses))
 
 
 def _start(d: Excitation, null: Model, model: Model) -> np.ndarray | None:

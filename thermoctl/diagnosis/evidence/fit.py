@@ -181,9 +181,13 @@ def _away(f: Fitted, e: Placed, sizes: Sequence[EffectParameter]) -> float:
 
 
 def _distance(f: Fitted, e: Placed, p: EffectParameter) -> float:
-    """Return how far a parameter is from the value at which it changes nothing, in standard deviations."""
+    """Return how far a parameter is from the value at which it changes nothing, in standard deviations.
+
+    Of one with a value for each recording, the farthest counts."""
     own = e.own[p.name]
-    return (f.plant.parameters[own].value - p.null) / max(f.sd[own], TINY)
+    q = f.plant.parameters[own]
+    values = [*q.values.values()] if q.per_recording else [q.value]
+    return (max(values, key=lambda v: abs(v - p.null)) - p.null) / max(f.sd[own], TINY)
 
 
 def fitted(
@@ -365,7 +369,11 @@ def as_refitted(case: Case, f: Fitted) -> Fitted:
 
 
 def closest(case: Case, f: Fitted) -> Fitted:
-    """Return the hypothesis at that of its two refits whose free run is closest to the data."""
+    """Return the hypothesis at that of its two refits whose free run is closest to the data.
+
+    The refit in white noise does not know earlier recordings."""
+    if f.past.unknowns:
+        return f
 
     def far(of: Fitted) -> float:
         """Return the sum over outputs of the mean squares of errors over the noise."""
@@ -397,9 +405,9 @@ def log_density(posterior: Posterior, z: np.ndarray, sd: Mapping[str, float]) ->
     for precision, ks in ((posterior.precision, gaussian(posterior)), (stated, posterior.believed)):
         out += 0.5 * float(np.linalg.slogdet(precision[np.ix_(ks, ks)] / (2 * np.pi))[1])
     for k, (_, p) in posterior.sizes.items():
-        q = posterior.problem.unknowns[k][0]
+        q, r = posterior.problem.unknowns[k]
         if k not in posterior.shared:
-            value = float(values[0, posterior.model.parameters.index(q)])
+            value = float(values[r or 0, posterior.model.parameters.index(q)])
             out += _size(p, value, sd[q]) + np.log(posterior.problem.scales[q].slope(value))
     new = [e for e in posterior.effects if e.key not in posterior.past.keys]
     periods = sum(kind == "periods" for e in new for kind in e.candidate.effect.shapes.values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -156,15 +157,41 @@ def errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
 
 def _errors_aside(case: Case, plant: Plant, table: Table) -> np.ndarray:
     """Return the errors on a recording set aside, as `errors_aside`, of a plant with its events."""
+    try:
+        return _aside(case, plant, table).residuals[0]
+    except FAILS:  # InputError: it has no reading
+        return np.full_like(compile_plant(plant).excitation(table).y, np.nan)
+
+
+def _aside(case: Case, plant: Plant, table: Table) -> refit.Fit:
+    """Return the refit of a recording's own unknowns: initial states, and values by recording (`_own`)."""
     free = tuple(q for q, p in plant.parameters.items() if p.range)
-    held = {q: dataclasses.replace(p, range=None) for q, p in plant.parameters.items()}
+    own = _own(case, plant)
+    held = {q: p if q in own else dataclasses.replace(p, range=None) for q, p in plant.parameters.items()}
     model = compile_plant(dataclasses.replace(plant, parameters=held), free)  # the same machine code
     d = model.excitation(table)
-    try:
-        fitted = refit.fit_by_first_parts(model, [d], case.noise, tolerance=1e-3, seconds=np.inf)
-    except FAILS:  # InputError: it has no reading
-        return np.full_like(d.y, np.nan)
-    return fitted.residuals[0]
+    return refit.fit_by_first_parts(model, [d], case.noise, tolerance=1e-3, seconds=np.inf)
+
+
+def _own(case: Case, plant: Plant) -> set[str]:
+    """Return what has a value in each recording, by the plant file or since it differs between recordings."""
+    own = {q: p for q, p in plant.parameters.items() if p.per_recording and p.range}
+    return {q for q, p in own.items() if p.known or q in case.plant.parameters}
+
+
+def with_values_aside(case: Case, plant: Plant, reserve: Sequence[Table]) -> Plant:
+    """Return a plant with the values that its parameters have in recordings set aside.
+
+    The value for any other recording stays."""
+    parameters = dict(plant.parameters)
+    for table, q in itertools.product(reserve, _own(case, plant)):
+        try:
+            value = _aside(case, plant, table).parameters()[q]
+        except FAILS:
+            continue
+        p = parameters[q]
+        parameters[q] = dataclasses.replace(p, values={**p.values, table.name: value})
+    return dataclasses.replace(plant, parameters=parameters)
 
 
 def _crossed(case: Case, f: Fitted) -> list[np.ndarray]:

@@ -155,7 +155,7 @@ class _Builder:
             if air and unit in TEMPERATURE and air not in ex.names(y):
                 shift = zero_of(unit) - zero_of(self._unit_of(name(air)))
                 symbols["reference"] = ex.add(name(air), num(shift))
-        symbols["duration"], symbols["here"] = num(self.rig.duration), num(1.0)
+        symbols["duration"] = num(self.rig.duration)
         # a parameter, since a bare number of 1 s would vanish from a product, and its unit with it
         sample = Parameter(self.c.own("sample"), float(f"{self.rig.sample:.6g}"), "s")
         self.parameters[sample.name], symbols["sample"] = sample, name(sample.name)
@@ -163,16 +163,16 @@ class _Builder:
             values = {r: v for r, v in begins.items() if r}
             begin = Parameter(self.c.own("begin"), begins[""], "s", None, True, values)
             self.parameters[begin.name], symbols["t"] = begin, ex.add(name("t"), name(begin.name))
-            there = {r: float(v >= 0) for r, v in values.items()}
-            here = Parameter(self.c.own("here"), float(begins[""] >= 0), "1", None, True, there)
-            self.parameters[here.name], symbols["here"] = here, name(here.name)
         return symbols
 
     def _own_parameter(self, p: EffectParameter, value: float, low: float, high: float) -> Parameter:
         limits = (low, high) if np.isfinite(low) and np.isfinite(high) and low < high else None
         if limits:
             value = min(max(value, low), high)
-        return Parameter(self.c.own(p.name), value, self._unit(p.unit), limits, p.per_recording)
+        first = (self.rig.drives[0].name,) if p.from_first and not self.rig.earlier else ()
+        null = dict.fromkeys(first, p.null)
+        own = Parameter(self.c.own(p.name), value, self._unit(p.unit), limits, p.per_recording, null)
+        return dataclasses.replace(own, known=first)
 
     def _unit_of_y(self) -> str | None:
         reading = self.c.reading

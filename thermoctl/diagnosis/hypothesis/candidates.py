@@ -54,15 +54,13 @@ def _placed(rig: Rig, effect: Effect) -> Iterator[tuple[Place, Effect]]:
             yield place, here
 
 
-def candidates(rig: Rig, effects: Mapping[str, Effect], again: bool = False) -> list[Candidate]:
-    """Return every effect at every place where it can act, with every choice of the signals it needs.
-
-    `again`: also those that only earlier recordings can show."""
+def candidates(rig: Rig, effects: Mapping[str, Effect]) -> list[Candidate]:
+    """Return every effect at every place where it can act, with every choice of the signals it needs."""
     out = []
     for effect in effects.values():
         if not set(effect.reads) <= rig.plant.nodes.keys() | rig.plant.inputs.keys():
             continue
-        clocks = _clocks(rig, effect, again)
+        clocks = _clocks(rig, effect)
         for place, here in _placed(rig, effect):
             for variant, changes in enumerate(effect.changes):
                 if any("recorded" in c for c in changes) and not place.input:
@@ -77,22 +75,20 @@ def candidates(rig: Rig, effects: Mapping[str, Effect], again: bool = False) -> 
     return out
 
 
-def _clocks(rig: Rig, effect: Effect, again: bool) -> dict[str, dict[str, float]]:
+def _clocks(rig: Rig, effect: Effect) -> dict[str, dict[str, float]]:
     """Return when each recording begins on the clock of an event, s, by name of that clock; "" is any other.
 
-    The event is at the same time of each, or at a time of one that it changes alone or with later ones.
-    A parameter that differs between recordings does so in one, or from one on: not in all."""
-    differs = effect.where == DIFFERS
-    clocks: dict[str, dict[str, float]] = {} if differs and not again else {"": {}}
+    The event is at the same time of each, or at a time of one that it changes alone or with later ones."""
+    clocks: dict[str, dict[str, float]] = {"": {}}
     names = [d.name for d in rig.drives]
     in_pieces = any(d.x0 is not None for d in rig.drives)
-    if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()) and not differs:
+    if in_pieces or len(names) < 2 or EVENTS.isdisjoint(effect.shapes.values()):
         return clocks
     before, after = -FAR * rig.duration, FAR * rig.duration
-    for k, own in enumerate(names[differs:], differs):
+    for k, own in enumerate(names):
         past = {n: before if j < k else after for j, n in enumerate([*names, ""])}
         clocks[f" from {own}"] = past | {own: 0.0}
-    for own in names[differs:-1]:
+    for own in names[:-1]:
         clocks[f" in {own}"] = dict.fromkeys([*names, ""], before) | {own: 0.0}
     return clocks
 

@@ -52,7 +52,7 @@ SYMBOLS: Mapping[str, tuple[str, ...]] = {
     "free_parameter": ("p",),
 }
 """The symbols of each place that an effect's expressions may read; its nodes are also ends of flows."""
-EVERYWHERE = ("air", "reference", "duration", "sample", "t", "here")
+EVERYWHERE = ("air", "reference", "duration", "sample", "t")
 NEEDS = ("x", "v", "i", "T")
 SHAPES: Mapping[str, tuple[str, ...]] = {
     "onsets": ("onset",),
@@ -91,6 +91,7 @@ class EffectParameter:
     - `shape`: the name of the shape value that it equals
     - `null`: its value where the effect is absent
     - `at_zero`: does 0 turn the effect into the simpler one that it contains?
+    - `from_first`: does its value in each recording count from the first one, where it is null?
     - `of`: with 'jump', low and high are multiples of the largest sudden change of the reading"""
 
     name: str
@@ -106,6 +107,7 @@ class EffectParameter:
     origin: str | None = None
     at_zero: bool = False
     of: str | None = None
+    from_first: bool = False
 
     @property
     def amplitude(self) -> bool:
@@ -163,8 +165,8 @@ class Effect:
 
     @property
     def timed(self) -> bool:
-        """Does it depend on the time or the recording, or have parameters with a value for each recording?"""
-        named = re.search(r"\b(t|here)\b", str(self.changes))
+        """Does it depend on the time, or have parameters with a value for each recording?"""
+        named = re.search(r"\bt\b", str(self.changes))
         return bool(named) or any(p.per_recording for p in self.parameters)
 
 
@@ -262,6 +264,7 @@ def _parameter(name: str, p: Section, given: set[str], parameters: Mapping[str, 
         None if origin == "none" else origin,
         p.flag("at_zero", False),
         None if of == "none" else of,
+        p.flag("from_first", False),
     )
     p.end()
     return parameter

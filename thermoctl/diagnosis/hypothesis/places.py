@@ -342,7 +342,11 @@ def _fixed_flows(rig: Rig) -> Iterator[Place]:
 
 
 def _free_parameters(rig: Rig) -> Iterator[Place]:
-    """Yield parameters with a range that all recordings share, and that a flow, storage or output reads."""
+    """Yield parameters with a range that recordings share, and that a flow, storage or output reads.
+
+    Parts of one recording have the same values."""
+    if len(rig.drives) + rig.earlier < 2 or any(d.x0 is not None for d in rig.drives):
+        return
     p = rig.physics
     read = [n.storage for n in p.nodes.values()] + [f.rate for f in p.flows.values()]
     used = set().union(*map(ex.names, [*read, *(o.value for o in p.outputs.values())]))

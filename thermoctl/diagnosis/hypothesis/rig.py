@@ -126,12 +126,18 @@ class Rig:
       the pairs that units show
     - `temperatures`, `velocities`, `currents`: nodes; `heat_inputs`: inputs that are temperatures
     - `moving_inputs`: those that change; `spare`: recorded columns that the plant does not read
+    - `earlier`: do earlier recordings tell what is the same in these?
     - `air`: the ambient; `duration`, `sample`: of the longest recording, and its shortest interval, s"""
 
     def __init__(
-        self, plant: Plant, drives: Sequence[Excitation], columns: Sequence[Mapping[str, np.ndarray]]
+        self,
+        plant: Plant,
+        drives: Sequence[Excitation],
+        columns: Sequence[Mapping[str, np.ndarray]],
+        earlier: bool = False,
     ):
         self.plant, self.drives, self.columns = plant, list(drives), list(columns)
+        self.earlier = earlier
         self._jumps: dict[str, float] = {}  # by column
         self.physics = p = dataclasses.replace(
             plant,

@@ -16,6 +16,7 @@ Rows = tuple[tuple[str, ...], Sequence[tuple[str, ...]]]  # heads, rows
 NONE = "–"
 WIDE = 1.96  # standard deviations to either side of a 95 % interval
 ALTERNATIVES = 8  # largest number of alternatives that are listed
+SOME = 4  # largest number of recordings whose values are listed
 PROMISED = 12  # largest number of effects without a refit that are listed
 PLAIN = (1e-3, 1e6)  # values outside this range are written with a power of ten
 COLUMNS = {
@@ -232,7 +233,11 @@ def parameter_rows(finding: Result) -> Rows:
 
 
 def _between(parameter: Mapping[str, Any]) -> str:
-    """Return the least and the largest value of a parameter that has one for each recording."""
+    """Return the values of a parameter by recording; of more than SOME the least and the largest one."""
+    if len(parameter["values"]) <= SOME:
+        return ", ".join(
+            f"{with_interval(v, parameter['sd'])} in {r}" for r, v in parameter["values"].items() if v
+        )
     ends = sorted({min(parameter["values"].values()), max(parameter["values"].values())})
     return " .. ".join(with_interval(v, parameter["sd"]) for v in ends)
 

@@ -56,21 +56,15 @@ def notes(d: Diagnosis) -> list[str]:
 
 
 def _differ(d: Diagnosis) -> list[str]:
-    """Return a sentence where recordings set aside are not followed, though nothing is missing in the others.
-
-    A recording has values of its own of the parameters that the plant file frees for each."""
+    """Return a sentence where recordings set aside are not followed, though the others are."""
     over = d.worth.not_followed
     if d.decision.verdict != "consistent" or not over:
         return []
-    own = [q for q, p in d.case.plant.parameters.items() if p.per_recording and p.range]
-    why = (
-        f"{listed(own)} {'are' if own[1:] else 'is'} not fitted there"
-        if own
-        else "they differ from the others"
-    )
     worst = max(over, key=lambda o: over[o])
+    names = d.worth.names
+    differ = "differ" if names[1:] else "differs"
     return [
-        f"the error of {worst} is {over[worst]:.2g} times the noise in {listed(d.worth.names)}, set aside: {why}"
+        f"the error of {worst} is {over[worst]:.2g} times the noise in {listed(names)}, set aside, which {differ} from the others"
     ]
 
 

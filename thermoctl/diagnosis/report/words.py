@@ -100,8 +100,8 @@ def name(finding: Result) -> str:
         text += (
             f" from {start:.4g} s" + (f" of {run}" if stays else "") + (f" to {end:.4g} s" if ends else " on")
         )
-    elif finding.get("recording"):
-        text += f" {'from' if finding['lasts'] else 'in'} {finding['recording']}{' on' if finding['lasts'] else ''}"
+    if finding.get("differs_in"):
+        text += f" in {listed(finding['differs_in'])}"
     return f"{text} at {finding['where']}"
 
 

@@ -369,7 +369,7 @@ def remade(
     drives: Sequence[Excitation] = case.drives(case.null.model)
     try:
         for e in effects:
-            c = found_again(candidates(case.rig(plant, drives), entries, again=True), e.key, e.label)
+            c = found_again(candidates(case.rig(plant, drives), entries), e.key, e.label)
             plant, before = c.extend(e.values, e.ranges), plant
             drives = case.drives_after(plant, before, drives)
             placed = (*placed, Placed(c, {p: c.own(p) for p in e.values if c.own(p) in plant.parameters}))

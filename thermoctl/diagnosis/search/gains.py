@@ -71,21 +71,24 @@ def log_p(gain: float, dims: int) -> float:
 class Column:
     """The recipe of a direction: an effect at one shape, along one direction `dim` of its amplitudes.
 
-    `group`: its group of the candidate. `values`: the plant's parameters with a small amplitude; `scale`: the
-    factor from the change at this amplitude to that at amplitude 1."""
+    `group`: its group of the candidate. `recording`: the only one that it changes; "": all. `values`: the
+    plant's parameters with a small amplitude; `scale`: the factor from the change at this amplitude to that
+    at amplitude 1."""
 
     candidate: Candidate
     group: Any
     shape: dict[str, float]
     dim: tuple[float, ...]
+    recording: str
     overlay: Callable[[], Overlay]
     values: Mapping[str, float]
     scale: float
 
     def changes(self, trajectory: Trajectory) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
         """Return its forces by state and its changes of outputs along a trajectory, all numbers finite."""
-        if self.candidate.begins.get(trajectory.drive.name, 0.0) < 0:
-            return {}, {}  # an event that comes later
+        elsewhere = self.recording and self.recording != trajectory.drive.name
+        if elsewhere or self.candidate.begins.get(trajectory.drive.name, 0.0) < 0:
+            return {}, {}  # or an event that comes later
         try:
             parts = self.overlay().changes(self.values, trajectory)
         except (KeyError, ex.ExpressionError):
@@ -224,6 +227,8 @@ def _sizes(columns: Sequence[Column], coefficient: np.ndarray) -> tuple[dict[str
     if "phases" in c.effect.shapes.values():
         phase = float(np.arctan2(coefficient[1], coefficient[0]))
         return {**shape, "phase": phase}, [float(np.hypot(*coefficient))]
+    if columns[0].recording:  # a refit begins with their mean
+        return shape, [float(np.mean(coefficient))]
     if any(p.amplitude for p in c.effect.parameters):
         return shape, list(np.array([q.dim for q in columns]).T @ coefficient)
     factor = float(np.clip(coefficient[0], 1e-3, 5.0))  # a short lag changes the outputs in proportion

@@ -157,21 +157,21 @@ def sharpened(metric: Metric, rig: Rig, direction: Direction) -> Direction:
 class Group:
     """The columns of an effect at a place that are scored together: amplitudes at one shape, or onsets.
 
-    `sizes`: shape and direction in the amplitudes of each column. `overlay`: returns the candidate's Overlay,
-    which is built once."""
+    `sizes`: shape, direction in the amplitudes and recording of each column. `overlay`: returns
+    the candidate's Overlay, which is built once."""
 
     candidate: Candidate
     number: Any
-    sizes: tuple[tuple[dict[str, float], tuple[float, ...]], ...]
+    sizes: tuple[tuple[dict[str, float], tuple[float, ...], str], ...]
     overlay: Callable[[], Overlay]
 
     def columns(self) -> Iterator[Column]:
         """Yield the columns."""
         c = self.candidate
         scale = 1 / EPSILON if any(p.amplitude for p in c.effect.parameters) else 1.0
-        for shape, dim in self.sizes:
+        for shape, dim, recording in self.sizes:
             own = {c.own(k): v for k, v in _values(c, shape, dim).items()}
-            yield Column(c, self.number, shape, dim, self.overlay, own, scale)
+            yield Column(c, self.number, shape, dim, recording, self.overlay, own, scale)
 
 
 def _values(c: Candidate, shape: Mapping[str, float], dim: Sequence[float]) -> dict[str, float]:
@@ -201,13 +201,18 @@ def groups_of(c: Candidate, metric: Metric, edges: np.ndarray | None = None) -> 
         for combination in itertools.product(*grids.values())
     ] or [{}]
     dims = effect.dims if any(p.amplitude for p in effect.parameters) else ((1.0,),)
-    sizes = [tuple(({**shape, **phase}, dim) for dim in dims for phase in phases) for shape in shapes]
+    names = [d.name for d in c.rig.drives[not c.rig.earlier :]]
+    only = names if any(p.from_first for p in effect.parameters) else [""]
+    sizes = [
+        tuple(({**shape, **phase}, dim, r) for dim in dims for phase in phases for r in only)
+        for shape in shapes
+    ]
     if windowed:
         sizes = [tuple(s for part in sizes for s in part)]
 
     @cache
     def overlay() -> Overlay:
         """Return the parts of the plant that the candidate changes: the groups share them."""
-        return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0])))
+        return Overlay(c.rig.plant, c.extend(_values(c, *sizes[0][0][:2])))
 
     return [Group(c, ("all",) if windowed else (g,), part, overlay) for g, part in enumerate(sizes)]

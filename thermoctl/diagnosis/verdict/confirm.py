@@ -88,8 +88,8 @@ class Blocks:
         _, push, bend = problem.prior_terms(values, True)
         precision, step = log.precision.copy(), log.mean - z
         for k, (_, p) in log.sizes.items():
-            name = problem.unknowns[k][0]
-            value = float(values[0, log.model.parameters.index(name)])
+            name, r = problem.unknowns[k]
+            value = float(values[r or 0, log.model.parameters.index(name)])
             none = z[k] + (p.null - value) / problem.scales[name].slope(value)
             self.low[k], self.high[k] = min(self.low[k], none), max(self.high[k], none)
         for k in set(range(len(z))) - {*gaussian(log), *log.believed, *log.sizes}:

@@ -153,7 +153,7 @@ class Problem:
             if q not in self.scales:
                 continue
             if parameters[q].per_recording:
-                for r in recordings:
+                for r in (r for r in recordings if self.excitations[r].name not in parameters[q].known):
                     self.columns[r, c] = len(self.unknowns)
                     self.unknowns.append((q, r))
             else:
