@@ -14,6 +14,7 @@ from thermoctl.diagnosis.data.pieces import in_pieces, with_free_starts
 from thermoctl.diagnosis.evidence.between import between
 from thermoctl.diagnosis.evidence.fit import closest, with_residuals
 from thermoctl.diagnosis.evidence.held_out import cleaned, split, with_values_aside, worth
+from thermoctl.diagnosis.evidence.input_noise import with_input_noise
 from thermoctl.diagnosis.evidence.levels import only_noise, over_noise, remainder
 from thermoctl.diagnosis.evidence.steady import steady
 from thermoctl.diagnosis.evidence.unknown import left, reached
@@ -123,7 +124,7 @@ def sought(
         """Return the plant's case and the reserve with inputs that are steady beside `of`; levels, too?"""
         beside = partial(made, of=of)
         found, kept, taken = steady(beside(chosen_on), beside, chosen_on, reserve)
-        known = found if of is plant else made(found.tables)
+        known = with_input_noise(found if of is plant else made(found.tables))
         known.notes.extend([*taken.values(), *hung, *notes, *more])
         return known, kept, "levels" in taken
 
@@ -175,7 +176,7 @@ def decided(sought: Sought) -> Diagnosis:
     if remains >= numbers.name and not (chosen or asked):
         sensors = coloured(known, null)
         known = replace(known, notes=[*known.notes, *sensors])
-    if remains < numbers.name:
+    if remains < numbers.name and not known.noisy:  # noise of an input is such a flow
         unknown = flow_missing(known, tried[chosen].fitted, reach.nodes)
     if unknown.probability >= numbers.name:
         after = replace(after, node=unknown.node or after.node)

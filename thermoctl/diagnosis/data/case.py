@@ -107,7 +107,7 @@ class Case:
 
     All hypotheses are scored in the same `coordinates` and `grids`. `off`: by output, the first sample minus
     the plant's initial value, where they contradict each other. `rtol`: relative local error of every
-    simulation. `outliers`: readings left out."""
+    simulation. `outliers`: readings left out. `noisy`: is noise of inputs in the grids?"""
 
     plant: Plant
     tables: tuple[Table, ...]
@@ -123,6 +123,7 @@ class Case:
     rtol: float = RTOL
     memory: Memory = NOTHING  # posterior of earlier recordings
     outliers: Outliers = ()
+    noisy: bool = False
     limits: Thresholds = field(default_factory=limits)  # numbers by which the diagnosis decides
 
     def drives(self, model: Model) -> list[Excitation]:

@@ -57,13 +57,14 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     slow = max(refitted.average.remainder) >= PRESENT
     other = Metric(plain, refitted.average, False) if loud or slow else None
     rig = case.rig(fitted.rough_plant, metric.drives)
-    added = (fitted.plant.nodes.keys() | fitted.plant.flows.keys()) - (
-        case.plant.nodes.keys() | case.plant.flows.keys()
+    now, own = fitted.plant, case.plant
+    added = (now.nodes.keys() | now.flows.keys() | now.parameters.keys()) - (
+        own.nodes.keys() | own.flows.keys() | own.parameters.keys()
     )
     placed = [
         c
         for c in candidates(rig, case.catalogue)
-        if c.key not in fitted.hypothesis.keys and not c.place.parts() & added
+        if c.key not in fitted.hypothesis.keys and not {c.place.where, *c.place.parts()} & added
     ]
     norms: list[Norms] = []
     metrics = [metric, other] if other else [metric]
