@@ -1,10 +1,9 @@
 """The noise of inputs' readings, which a plant adds up: a body heated by a noisy reading walks at random.
 
 A plant is driven by readings. Where a reading scatters by s about a smooth course, the outputs err by the
-plant's response to s e, e white. This is no error of a sensor and has no course that physics would explain: a
-heat source and a second ambient follow the slowest part of it. Its power in each band is the mean over DRAWS
-responses at the plant's refit. It is added to the spectrum of the stated noise (grids.py) where the plant
-alone is likelier so."""
+plant's response to s e, e white. A heat source or a second ambient would follow the slowest part of it. Its
+power in each band is the mean over DRAWS responses at the plant's refit. It is added to the spectrum of the
+stated noise (grids.py) where the plant alone is likelier so."""
 
 from __future__ import annotations
 
@@ -29,8 +28,7 @@ CLEARLY = 4.6  # nats: a plant without this noise is a hundredth as likely
 
 def with_input_noise(case: Case) -> Case:
     """Return the case with the noise of its inputs, if the plant alone is clearly likelier with it."""
-    moving = case.rig(case.plant, case.drives(case.null.model)).moving_inputs
-    columns = sorted({case.plant.inputs[i].column for i in moving})
+    columns = sorted({i.column for i in case.plant.inputs.values() if not case.plant.trusts(i.name)})
     found = {c: s for c in columns if (s := scatter([t.columns[c] for t in case.tables]))}
     if not found:
         return case
@@ -47,7 +45,9 @@ def with_input_noise(case: Case) -> Case:
 
 
 def scatter(columns: Sequence[np.ndarray]) -> float:
-    """Return the standard deviation of white noise about a smooth course (N,) by recording; 0 for any other."""
+    """Return the standard deviation of white noise about a smooth course; 0 for any other course.
+
+    `columns`: (N,) of each recording."""
     bent = [x[1:-1] - 0.5 * (x[:-2] + x[2:]) for x in columns]
     sd = 1.4826 * float(np.median(np.abs(np.concatenate(bent))))
     if not sd > 0:

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.between import CLEARLY, alone
+from thermoctl.diagnosis.evidence.input_noise import scatter
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import SimulationError
@@ -63,7 +64,7 @@ def steady(
     Levels, and then the smooth course of each other input, are taken where the plant alone fits clearly
     better with them. `made`: makes the case of recordings. Raises InputError."""
     given, n, notes = [*tables, *reserve], len(tables), dict[str, str]()
-    straight = sorted({i.column for i in case.plant.inputs.values() if i.linear})
+    straight = sorted({i.column for i in case.plant.inputs.values() if i.linear and not case.plant.trusts(i.name)})
     kinds: list[tuple[str, Kind]] = [("levels", _levels)]
     kinds += [("a smooth course", partial(_smoothed, column=c)) for c in straight]
     for what, kind in () if case.memory.recordings else kinds:
@@ -113,9 +114,8 @@ def _levels(
 def _smoothed(
     case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int, column: str
 ) -> Iterator[Courses]:
-    """Yield an input that moves and has no lost cell, smoother and smoother."""
-    moving = all(np.ptp(t.columns[column]) > 0 for t in given)
-    for width in WIDTHS if moving else ():
+    """Yield an input of white noise about a smooth course, smoother and smoother."""
+    for width in WIDTHS if scatter([t.columns[column] for t in given]) else ():
         yield {column: [gaussian_filter1d(t.columns[column], width) for t in given]}
 
 
