@@ -64,7 +64,9 @@ def steady(
     Levels, and then the smooth course of each other input, are taken where the plant alone fits clearly
     better with them. `made`: makes the case of recordings. Raises InputError."""
     given, n, notes = [*tables, *reserve], len(tables), dict[str, str]()
-    straight = sorted({i.column for i in case.plant.inputs.values() if i.linear and not case.plant.trusts(i.name)})
+    straight = sorted(
+        {i.column for i in case.plant.inputs.values() if i.linear and not case.plant.trusts(i.name)}
+    )
     kinds: list[tuple[str, Kind]] = [("levels", _levels)]
     kinds += [("a smooth course", partial(_smoothed, column=c)) for c in straight]
     for what, kind in () if case.memory.recordings else kinds:
