@@ -82,4 +82,4 @@ def test_noise_of_an_ambients_reading_is_no_shift():
     table.columns["outside"] += np.random.default_rng(1).normal(0, 0.6, len(table.t))
     result = contract(diagnose(loads(plant), [table], catalogue(), limits()))
     assert result["findings"] == []
-    assert any("readings of outside scatter about a smooth course" in note for note in result["notes"])
+    assert any("noise of outside (0.63), smoothed" in note for note in result["notes"])

@@ -124,9 +124,10 @@ def sought(
         """Return the plant's case and the reserve with inputs that are steady beside `of`; levels, too?"""
         beside = partial(made, of=of)
         found, kept, taken = steady(beside(chosen_on), beside, chosen_on, reserve)
-        known = with_input_noise(found if of is plant else made(found.tables))
-        known.notes.extend([*taken.values(), *hung, *notes, *more])
-        return known, kept, "levels" in taken
+        known = found if of is plant else made(found.tables)
+        known, kept = with_input_noise(known, made, kept)
+        known.notes.extend([*([taken] if taken else []), *hung, *notes, *more])
+        return known, kept, bool(taken)
 
     known, kept, levels = smooth(plant)
     tried = search(known)

@@ -1,24 +1,20 @@
-"""Inputs whose readings scatter about what drives the plant: levels, or a smooth course.
+"""Inputs that are driven in levels, and whose readings scatter about these.
 
 A simulation is driven by readings: a mass integrates the noise of a current's reading. A function of the
 reading that is flat at each level takes this noise away, and predicts every part better. A limit, a dead zone
 and a law with its edges at the levels do so. So the mean of each level is tried as the input. The mean has an
-error, too: it is fitted to the outputs, with its own standard error as the prior. An input on straight lines
-is smoothed by Gaussians of growing width. Otherwise a lag and an advance together would smooth it, or an
-advance by a part of a row."""
+error, too: it is fitted to the outputs, with its own standard error as the prior. An input without levels is
+smoothed in input_noise.py."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from thermoctl.diagnosis.data.case import Case
 from thermoctl.diagnosis.evidence.between import CLEARLY, alone
-from thermoctl.diagnosis.evidence.input_noise import scatter
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant.fitting.residuals import Problem
 from thermoctl.plant.simulation.simulate import SimulationError
@@ -32,7 +28,6 @@ SAME = 4.0  # standard errors of a difference of two means below which they are 
 # recordings of rigs and generated cases no moving input has more than 1.04.
 WHITE = 1.5
 FARTHEST = 3.0  # standard errors by which a fitted level is from its mean at most
-WIDTHS = (2.0, 8.0, 32.0)  # standard deviations of a smoothing Gaussian, in rows
 ROUNDS = 2  # number of fits of the levels, each about a new refit of the plant
 
 
@@ -53,72 +48,46 @@ class Levels:
 
 
 Courses = Mapping[str, Sequence[np.ndarray]]  # inputs (N,) by column and recording
-Kind = Callable[[Case, Callable[[Sequence[Table]], Case], Sequence[Table], int], Iterator[Courses]]
 
 
 def steady(
     case: Case, made: Callable[[Sequence[Table]], Case], tables: Sequence[Table], reserve: Sequence[Table]
-) -> tuple[Case, list[Table], dict[str, str]]:
-    """Return the case and the recordings set aside, with inputs without their scatter, and what was taken.
+) -> tuple[Case, list[Table], str]:
+    """Return the case and the recordings set aside, with levels in place of inputs, and a sentence on them.
 
-    Levels, and then the smooth course of each other input, are taken where the plant alone fits clearly
-    better with them. `made`: makes the case of recordings. Raises InputError."""
-    given, n, notes = [*tables, *reserve], len(tables), dict[str, str]()
-    straight = sorted(
-        {i.column for i in case.plant.inputs.values() if i.linear and not case.plant.trusts(i.name)}
-    )
-    kinds: list[tuple[str, Kind]] = [("levels", _levels)]
-    kinds += [("a smooth course", partial(_smoothed, column=c)) for c in straight]
-    for what, kind in () if case.memory.recordings else kinds:
-        if better := _better(case, made, given, n, kind):
-            case, given, columns, gain = better
-            notes[what] = (
-                f"the readings of {columns} scatter about {what}; with it the plant alone follows the recordings better "
-                f"({gain:.0f} nats): taken so"
-            )
-    return case, given[n:], notes
-
-
-def _better(
-    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int, kind: Kind
-) -> tuple[Case, list[Table], str, float] | None:
-    """Return case, recordings, columns and gain, nats, of the best courses; None if none is clearly better.
-
-    Of courses that become better one by one, the last is the best."""
-    best: tuple[Case, list[Table], str, float] | None = None
+    Levels are taken where the plant alone fits clearly better with them. `made`: makes the case of
+    recordings. Raises InputError."""
+    given, n = [*tables, *reserve], len(tables)
+    as_given = case, given[n:], ""
+    if case.memory.recordings:
+        return as_given
     try:
-        for courses in kind(case, made, given, n):
-            if best is None:
-                start = alone(case)
-            driven = _driven(given, courses)
-            other = made(driven[:n])
-            gain = alone(other) - start
-            if gain <= (best[3] if best else CLEARLY):
-                break
-            best = other, driven, ", ".join(courses), gain
+        found = _levels(case, made, given, n)
+        if not found:
+            return as_given
+        driven = _driven(given, _read(given, found))
+        other = made(driven[:n])
+        gain = alone(other) - alone(case)
     except (InputError, SimulationError, np.linalg.LinAlgError):
-        pass
-    return best
+        return as_given
+    if gain <= CLEARLY:
+        return as_given
+    note = (
+        f"the readings of {', '.join(found)} scatter about levels; with these the plant alone follows the recordings "
+        f"better ({gain:.0f} nats): taken so"
+    )
+    return other, driven[n:], note
 
 
 def _levels(
     case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int
-) -> Iterator[Courses]:
-    """Yield the levels of inputs, fitted to the first n recordings. Raises InputError, SimulationError."""
+) -> dict[str, Levels]:
+    """Return the levels of inputs, fitted to the first n recordings. Raises InputError, SimulationError."""
     columns = {i.column for i in case.plant.inputs.values()}
     found = {c: v for c in sorted(columns) if (v := levels([t.columns[c] for t in given]))}
     for _ in range(ROUNDS if found else 0):
         found = _fitted(made(_driven(given, _read(given, found))[:n]), given[:n], found)
-    if found:
-        yield _read(given, found)
-
-
-def _smoothed(
-    case: Case, made: Callable[[Sequence[Table]], Case], given: Sequence[Table], n: int, column: str
-) -> Iterator[Courses]:
-    """Yield an input of white noise about a smooth course, smoother and smoother."""
-    for width in WIDTHS if scatter([t.columns[column] for t in given]) else ():
-        yield {column: [gaussian_filter1d(t.columns[column], width) for t in given]}
+    return found
 
 
 def _read(tables: Sequence[Table], found: Mapping[str, Levels]) -> Courses:
