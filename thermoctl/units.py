@@ -202,35 +202,50 @@ def _size_by_pint(unit: str) -> float | None:
     return float(ends[1]) if ends[0] == 0 else None
 
 
+def without_brackets(unit: str) -> str:
+    """Return V*s/A for '(V) * s / (A)'; a unit with a factor such as 10 stays as it is."""
+    tokens = [(m.lastgroup or "", m[m.lastgroup or 0]) for m in _TOKEN.finditer(unit.strip())]
+    before = [("", ""), *tokens]
+    if "(" not in unit or any(
+        kind == "number" and text != "1" and before[k][0] != "power" for k, (kind, text) in enumerate(tokens)
+    ):
+        return unit
+    powers, _ = _product(tokens, 0, lambda symbol: ((symbol, Fraction(1)),))
+    shown = [(s, p > 0, "" if abs(p) == 1 else f"**{float(abs(p)):g}") for s, p in powers]
+    over = "*".join(s + power for s, above, power in shown if above)
+    return (over or "1") + "".join(f"/{s}{power}" for s, above, power in shown if not above)
+
+
 def _spelled(unit: str) -> str:
     plain = unit.replace("°C", "degC").replace("°", "deg").translate(_RAISED)
     return "dimensionless" if plain == "1" else plain
 
 
 Tokens = list[tuple[str, str]]
+Leaf = Callable[[str], Dimension]
 
 
-def _product(tokens: Tokens, position: int) -> tuple[Dimension, int]:
-    total, position = _factor(tokens, position)
+def _product(tokens: Tokens, position: int, leaf: Leaf | None = None) -> tuple[Dimension, int]:
+    total, position = _factor(tokens, position, leaf)
     while position < len(tokens) and tokens[position][1] != ")":
         sign = -1 if tokens[position][1] == "/" else 1
         if tokens[position][0] == "op" and tokens[position][1] != "(":
             position += 1
-        factor, position = _factor(tokens, position)
+        factor, position = _factor(tokens, position, leaf)
         total = times(total, factor, sign)
     return total, position
 
 
-def _factor(tokens: Tokens, position: int) -> tuple[Dimension, int]:
+def _factor(tokens: Tokens, position: int, leaf: Leaf | None) -> tuple[Dimension, int]:
     kind, text = tokens[position]
     position += 1
     if text == "(":
-        base, position = _product(tokens, position)
+        base, position = _product(tokens, position, leaf)
         if tokens[position][1] != ")":
             raise ValueError("')' was expected")
         position += 1
     elif kind == "symbol":
-        base = _symbol(text)
+        base = (leaf or _symbol)(text)
     elif kind == "number" and text[0] not in "+-":
         base = ()
     else:

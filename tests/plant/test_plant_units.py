@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import loads
-from thermoctl.units import SYMBOLS, dimension, readable_time
+from thermoctl.units import SYMBOLS, dimension, readable_time, without_brackets
 
 PLANT = """format: thermoctl-plant/1
 inputs: {{P: {{unit: W}}, air: {{unit: degC}}, v: {{unit: m/s}}}}
@@ -125,3 +125,22 @@ def test_any_text_is_a_dimension_or_one_error(text):
 )
 def test_a_time_is_written_in_a_readable_unit(seconds, text):
     assert readable_time(seconds) == text
+
+
+@pytest.mark.parametrize(
+    "unit, plain",
+    [
+        ("(V) * s / (A)", "V*s/A"),
+        ("(K)/s", "K/s"),
+        ("(K)/K", "1"),
+        ("1/(mm)**2", "1/mm**2"),
+        ("(V)/(rad/s)", "V*s/rad"),
+        ("(N*m) * s / (rad/s)", "N*m*s**2/rad"),
+        ("W/K/m^2", "W/K/m^2"),  # without brackets: as it came
+        ("(10 V)/s", "(10 V)/s"),
+        ("(m**0.5)/s", "m**0.5/s"),
+    ],
+)
+def test_a_unit_is_written_without_brackets(unit, plain):
+    assert without_brackets(unit) == plain
+    assert dimension(plain) == dimension(unit)

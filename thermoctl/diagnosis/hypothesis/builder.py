@@ -18,6 +18,7 @@ from thermoctl.plant import expression as ex
 from thermoctl.plant.expression import Expr, name, num
 from thermoctl.plant.fitting.residuals import Prior
 from thermoctl.plant.language import Flow, Input, Node, Output, Parameter, Plant
+from thermoctl.units import without_brackets
 
 _form = cache(ex.parse)  # each expression of the catalogue is parsed once
 LONGEST = 78  # characters of a node's name
@@ -203,7 +204,7 @@ class _Builder:
                 if unit is None:
                     return None
                 text = text.replace(key, "K" if unit in TEMPERATURE and text != key else unit)
-        return self._in_heat(text)
+        return without_brackets(self._in_heat(text))
 
     def _in_heat(self, text: str) -> str:
         """Return a unit with W and J as the heat flows at the place have them: mW and mJ, W/m^2 and J/m^2."""

@@ -34,6 +34,7 @@ from thermoctl.plant.fitting.refit import Fit
 from thermoctl.plant.fitting.residuals import FAR, Problem
 from thermoctl.plant.language import Flow, Input, Plant
 from thermoctl.plant.simulation.simulate import Model, SimulationError, compile_plant
+from thermoctl.units import without_brackets
 
 LATENT = "unknown_flow_into_"
 KNOTS = 240  # number of knots of a recording, shared among the nodes, if there are MANY recordings or fewer
@@ -345,7 +346,7 @@ def law_unit(plant: Plant, place: Place) -> str | None:
     flow, own = flow_unit(plant, place.target), plant.nodes[place.target].unit
     if place.part == "flow" or not flow or not own:
         return flow if place.part == "flow" else None
-    return f"({flow}) * s / ({'K' if own in TEMPERATURE else own})"
+    return without_brackets(f"({flow}) * s / ({'K' if own in TEMPERATURE else own})")
 
 
 def _explained(x: np.ndarray, target: np.ndarray) -> float:

@@ -8,7 +8,6 @@ own parameters absorb (screen.py). It depends on the plant, the inputs and the s
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -48,11 +47,10 @@ class Visible:
 
     @property
     def unit(self) -> str | None:
-        """The parameter's unit without needless brackets: K/s, not (K)/s."""
+        """The parameter's unit."""
         if not self.parameter:
             return None
-        unit = self.candidate.extend({}).parameters[self.candidate.own(self.parameter)].unit
-        return re.sub(r"\(([^()*/ ]+)\)", r"\1", unit) if unit else unit
+        return self.candidate.extend({}).parameters[self.candidate.own(self.parameter)].unit
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of `not_seen` in diagnosis.json."""
