@@ -15,7 +15,7 @@ import subprocess
 from collections.abc import Callable
 from typing import Any
 
-from tests.devices.ethercat import AL_STATUS, Slave, answer
+from tests.devices.ethercat import Slave, answer
 
 ETHERCAT = 0x88A4
 
@@ -25,7 +25,8 @@ class Wire:
 
     def __init__(self, slaves: list[Slave]) -> None:
         self.slaves, self.cut, self.lost, self.short = slaves, len(slaves), 0, 0
-        self.frames = self.lost_states = 0
+        self.frames = 0
+        self.lost_at: dict[int, int] = {}  # register: how many frames to it get lost
 
     def serve(self, name: str, pipe: Any) -> None:
         """Answer frames and the test's requests until the pipe is closed."""
@@ -53,8 +54,8 @@ class Wire:
         there = list(itertools.takewhile(lambda s: s.present, self.slaves[: self.cut]))
         for slave in there:
             slave.watch()
-        if self.lost_states and int.from_bytes(frame[20:22], "little") == AL_STATUS:
-            self.lost_states -= 1
+        if self.lost_at.get(register := int.from_bytes(frame[20:22], "little")):
+            self.lost_at[register] -= 1
         elif self.lost:
             self.lost -= 1
         elif there:

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from tests.devices.ethercat import INIT, OP, SAFEOP
+from tests.devices.ethercat import AL_STATUS, INIT, OP, SAFEOP
 from tests.devices.ethercat_cable import Cable, why_not
 from tests.devices.ethercat_devices import Drive, Terminal, coupler
 from tests.devices.harness import Rig
@@ -21,6 +21,7 @@ from thermoctl.files import yamlfile
 from thermoctl.files.yamlfile import InputError
 from thermoctl_hal.base.backend import AMP_DISABLED, AMP_ENABLED, AMP_FAULT, HardwareError, Sample
 from thermoctl_hal.ethercat import bus
+from thermoctl_hal.ethercat.slave import OUTPUT_CONTROL
 from thermoctl_hal.profiles.bind import bind, check_rig, rig_notes
 from thermoctl_hal.profiles.read import load_profile
 from thermoctl_hal.rig.make import driver
@@ -168,17 +169,28 @@ def test_single_lost_frames_are_counted_and_keep_the_values(cables, tmp_path):
 
 
 @wire
-def test_a_read_of_the_states_without_an_answer_loses_no_slave(cables, tmp_path):
+def test_a_read_of_the_states_without_an_answer_loses_no_slave(cables, tmp_path, monkeypatch):
     """One such read, which a busy machine misses, counted every slave as gone: the whole bus began anew."""
+    monkeypatch.setattr(bus, "LOST_FRAMES", 1000)  # a busy machine misses frames of data, too
     cable = cables(Drive, Terminal)
     with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable, more=', stale_after_s: 0.3')}]") as rig:
         rig.drive, rig.enable = 0.2, True
         rig.until(lambda: cable.ask(1, "output") == 100 and rig.status("coil_c") == "OK")
-        cable.ask(0, "lost_states", 4)
-        rig.until(lambda: cable.ask(0, "lost_states") == 0)
+        cable.ask(0, "lost_at", {AL_STATUS: 4})
+        rig.until(lambda: cable.ask(0, "lost_at")[AL_STATUS] == 0)
         cycles(rig, cable, 200)
         assert rig.devices[0].counts["reconnections"] == rig.devices[1].counts["reconnections"] == 0
         assert cable.ask(1, "output") == 100 and cable.ask(1, "enabled_count") == 1
+
+
+@wire
+def test_a_lost_answer_of_the_set_up_ends_no_thread(cables, tmp_path):
+    """pysoem's own error for it ended the poller of the drive, for good."""
+    cable = cables(Drive, Terminal)
+    cable.ask(0, "lost_at", {OUTPUT_CONTROL: 2})
+    with Rig(tmp_path, f"[{drive(cable)}, {terminal(cable)}]") as rig:
+        rig.until(lambda: "slave 1 does not answer" in problem(rig, "amplifier_state"))
+        rig.until(lambda: rig.status("amplifier_state") == rig.status("coil_c") == "OK")
 
 
 @wire

@@ -183,6 +183,8 @@ class EthercatBus:
             self.described[position].check(self.slave(position))
         except HardwareError as e:
             raise HardwareError(f"{self.interface}: {e}") from None
+        except Exception as e:  # the errors of pysoem have no common base
+            raise HardwareError(f"{self.interface}: slave {position} does not answer ({e!r})") from None
 
     def _found(self) -> str:
         return ", ".join(
