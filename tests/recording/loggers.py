@@ -318,6 +318,17 @@ CASES = (
     Case("Windows in Chinese", "halves.csv", rows("时间,T\n", "2026/3/1 上午11:59:5{i},{T}", 6, "2026/3/1 下午12:00:00,30\n"), {"T": [*RISING, 30]}, t=[*T6, 10]),
     Case("a logger that lost power", "power.csv", rows("Time [s],T\n", "{i}.0,{T}.0").encode() + bytes(700) + b"\n6.0,26.0\n7.0,2", {"T": [*RISING, 26]}, t=[*T6, 6]),
     Case("two files joined, each with a mark of byte order", "joined.csv", 2 * b"\xef\xbb\xbfTime,T\n0,20\n1,21\n2,22\n", {"T": RISING[:3]}, t=T6[:3], how={"run": 2}),
+    Case("Beckhoff TwinCAT Scope, two rates", "rates.csv", "Name\tT\tName\tP\nSampleTime[ms]\t1000\tSampleTime[ms]\t500\nUnit\t(None)\tUnit\tW\n"
+         + "".join(f"{x}\t{500 * k}\t{k}\n" for k, x in enumerate(["0\t20", "1000\t21", "2000\t22", "EOF\tEOF", "EOF\tEOF"])),
+         {"T": [20, np.nan, 21, np.nan, 22], "P": [0, 1, 2, 3, 4]}, [0, 0.5, 1, 1.5, 2], {"P": "W"}),
+    Case("Rockwell FactoryTalk, a trend", "trend.csv", rows("Trend Name:,Run\nSample Period:,1000 ms\n\nHeader:,Date,Time,T,P\n", "Data,03/14/2026,10:00:{s};500,{T}.0,{P}"),
+         {"T": RISING, "P": POWER}),
+    Case("Ignition, a dataset", "dataset.csv", rows('"#NAMES"\n"t_stamp","T","P"\n"#TYPES"\n"date","D","D"\n"#ROWS","6"\n', '"' + DATE + ' 10:00:{s}","{T}","{P}"'),
+         {"T": RISING, "P": POWER}),
+    Case("InfluxDB, series of one measurement by a tag", "tags.csv", rows("name,time,host,value\n", "temp,177235920{i}000000000,a,{T}")
+         + rows("", "temp,177235920{i}000000000,b,{P}"), {"a": RISING, "b": POWER}),
+    Case("Windows performance monitor", "perfmon.csv", rows('"(PDH-CSV 4.0) (UTC)(0)","\\\\PC\\Fan","\\\\PC\\Load"\n', '"03/14/2026 10:00:{s}.123","{T}"," "'),
+         {"\\\\PC\\Fan": RISING}),
     Case("JSON lines", "run.jsonl", rows("", '{{"time": "' + DATE + 'T10:00:{s}Z", "T": {T}, "P": {P}}}'), {"T": RISING, "P": POWER}),
 )  # fmt: skip
 

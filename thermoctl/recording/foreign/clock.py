@@ -28,7 +28,7 @@ _ZONES |= dict(est=-5, edt=-4, cdt=-5, mst=-7, mdt=-6, pst=-8, pdt=-7, jst=9, ks
 _LETTER = r"[^\x00-\x40\x5B-\x60\x7B-\x7F]"
 _DATE = r"(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|{L}{3,4})[-/.](?P<c>\d{1,4})".replace("{L}", _LETTER)
 _CLOCK = (
-    r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:](?P<f>\d{1,9})\d*)?)?\s*(?P<p>[AaPp][Mm])?"
+    r"(?P<h>\d{1,4}):(?P<m>\d{2})(?::(?P<s>\d{2})(?:[.,:;](?P<f>\d{1,9})\d*)?)?\s*(?P<p>[AaPp][Mm])?"
     r"\s*(?P<z>[+-]\d{2}:?\d{2}|[A-Za-z]{1,4})?"
 )
 _PATTERN = rf"^(?:{_DATE}(?:[T ,;]\s*|$))?(?:{_CLOCK})?$"

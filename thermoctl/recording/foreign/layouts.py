@@ -216,13 +216,7 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
 
 def pivoted(sheet: Sheet) -> list[Sheet] | None:
     """Return a sheet for each signal of a long table (signal, time, value or values); None for a wide one."""
-    lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
-    identity = next((lower[k] for k in IDS if k in lower and _any(sheet.columns[lower[k]])), None)
-    value = next((lower[k] for k in VALUES if k in lower), None)
-    if identity is None and value is None:
-        identity, value = _labelled_columns(sheet)
-    if identity is None or value is None or identity == value:
-        identity, value = _told_apart(sheet), None
+    identity, value = _identity_and_value(sheet)
     ids = None if identity is None else _signals(identity, sheet.columns[identity])
     if identity is None or ids is None:
         return None
@@ -259,6 +253,20 @@ def pivoted(sheet: Sheet) -> list[Sheet] | None:
     return sheets or None
 
 
+def _identity_and_value(sheet: Sheet) -> tuple[str | None, str | None]:
+    """Return the columns that name the signal of a row, and that hold its value; None where none does."""
+    lower = {n.strip().lower(): n for n in reversed(sheet.columns)}
+    identity = next((lower[k] for k in IDS if k in lower and _any(sheet.columns[lower[k]])), None)
+    value = next((lower[k] for k in VALUES if k in lower), None)
+    if identity is None and value is None:
+        identity, value = _labelled_columns(sheet)
+    if identity is None or value is None or identity == value:
+        return _told_apart(sheet), None
+    if identity[:1] != "_" and _is_one(sheet.columns[identity]):
+        return _told_apart(sheet) or identity, value  # series of one measurement differ in a tag
+    return identity, value
+
+
 def _told_apart(sheet: Sheet) -> str | None:
     """Return the column whose words, or whose numbers by its name, tell whose reading a row is.
 
@@ -293,6 +301,10 @@ def _told_apart(sheet: Sheet) -> str | None:
             sheet.notes.append(f"a long table: '{name.strip()}' tells whose reading a row is")
             return name
     return None
+
+
+def _is_one(cells: Any) -> bool:
+    return not isinstance(cells, np.ndarray) and len(pc.unique(cells)) == 1
 
 
 def _any(cells: Any) -> bool:
@@ -359,7 +371,7 @@ def _signals(name: str, cells: Any) -> pa.Array | None:
         return None
     texts = pc.replace_substring_regex(pc.fill_null(texts, ""), r"\s*[:=]$", "")
     prefix = "channel" if NO_NAME.match(name) else name.strip()
-    return pc.replace_substring_regex(texts, r"^(\d+)$", rf"{prefix}_\1")
+    return pc.replace_substring_regex(texts, r"^(\d+)$", prefix.replace("\\", r"\\") + r"_\1")
 
 
 def _places(place: Callable[[int], str], rows: np.ndarray) -> Callable[[int], str]:

@@ -63,7 +63,8 @@ _NO_TABLES = (
     (b'"TOB', "binary data of Campbell; convert it to TOA5 with LoggerNet or CardConvert"),
     (b"%PDF", "a PDF; export the table as CSV or .xlsx"),
     (b"version https://git-lfs", "a pointer of Git LFS in place of the file; `git lfs pull` brings it"),
-    (b"<?xml", "XML; export the table as CSV"),
+    (b"<?xml", "XML; export the table as CSV (of an RRD: `rrdtool fetch FILE AVERAGE`)"),
+    (b"IGOR", "waves of Igor; save them as a table with names"),
     (b"<!doctype html", "a web page; save its table as CSV"),
     (b"<html", "a web page; save its table as CSV"),
 )
@@ -81,6 +82,8 @@ _ARTISAN = {"Time1", "Time2", "ET", "BT"}  # a coffee roaster's log: minutes and
 SHOWN = 8192  # number of last bytes that show the digits of the last column
 FEW = 6  # least number of lines that show them
 _STAMPED = re.compile(rb"(?m)^(\d\d:\d\d:\d\d\.\d{3}) -> ")  # Arduino's monitor before each line
+# The header of Ignition's datasets: names, types, number of rows.
+_DATASET = re.compile(rb'\A"#NAMES"\r?\n(.*\n)"#TYPES".*\n.*\n"#ROWS".*\n')
 _FETCHED = re.compile(rb"(?m)^(\d{9,10}):(?=[ \t])")  # the times of rrdtool fetch
 _SUFFIXES = {".mf4": "mdf", ".mdf": "mdf", ".tdms": "tdms", ".xlsx": "excel", ".xlsm": "excel"}
 _SUFFIXES |= {
@@ -212,6 +215,7 @@ def _text(path: Path, text: bytes, how: How, notes: list[str]) -> list[Sheet]:
         raise formats.frames(path)
     if (special := layouts.special(path, text)) is not None:
         return [p for s in special for p in layouts.pivoted(s) or [s]]
+    text = _DATASET.sub(rb"\n\n\n\n\1", text)
     text = _one_header(_with_whole_cells(_fetched(text)), notes)
     if 2 * len(_QUOTED.findall(text[:HEAD])) > text[:HEAD].count(b"\n"):
         text = _QUOTED.sub(rb"\1", text)

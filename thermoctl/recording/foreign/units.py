@@ -30,7 +30,8 @@ WIDE = str.maketrans("（）［］，：％", "()[],:%")  # as Chinese and Japan
 _SCALE = re.compile(r"(?i)(?:^|[\W_])(celsius|fahrenheit|kelvin)$")
 # A number that no letter precedes, and the word behind it.
 _FACTOR = re.compile(r"(?:(?<![^\W_])[x×]?|(?<=\de))[\d.,^/-]*\d\s*\*?\s*([^\W\d_]+)")
-_NO_UNITS = {"", "-", "–", "--", "ts", "rn", "0/1", "1/0", *WORDS["pairs"].split()}  # ts and rn: TOA5
+# ts and rn are Campbell's.
+_NO_UNITS = {"", "-", "–", "--", "none", "(none)", "ts", "rn", "0/1", "1/0", *WORDS["pairs"].split()}
 _SPELLED = {word: unit for unit, words in SPELLINGS.items() for word in words.split(" | ")}
 
 
