@@ -77,6 +77,25 @@ assert "lines are lost" in said[-2] and said[-1].endswith("state tick=2000"), sa
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_disk_that_hangs_holds_up_one_line_and_not_each():
+    """Each command waited 2 s for its line in a file on such a disk, and `stop` 13 s."""
+    code = """
+import os, sys, time
+from thermoctl import log
+write = os.write
+os.write = lambda fd, data: (time.sleep(0.6), write(fd, data))[1]
+start_s = time.monotonic()
+for k in range(50):
+    log.console_log("state", tick=k)
+assert time.monotonic() - start_s < 3.0
+log.time.monotonic = lambda: start_s + 60.0
+log.console_log("state", tick=50)
+"""
+    said = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, check=True).stderr
+    first, lost, last = said.splitlines()
+    assert first.endswith("tick=0") and "49 lines are lost" in lost and last.endswith("tick=50")
+
+
 def test_what_libraries_and_threads_say_are_events_too():
     code = """
 import logging, threading, warnings

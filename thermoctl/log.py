@@ -13,6 +13,7 @@ import os
 import select
 import sys
 import threading
+import time
 import traceback
 from collections.abc import MutableMapping
 from typing import Any
@@ -21,6 +22,7 @@ import structlog
 
 _bound: dict[str, Any] = {}
 WAIT_S = 0.1
+SLOW_S, PAUSE_S = 0.5, 10.0  # after a write that took so long, none is tried for PAUSE_S
 _LAST = ("rig", "axis", "run")  # fields at a line's end
 
 
@@ -93,11 +95,15 @@ class _Stderr:
 
     lost = 0
     torn = False
+    again_s = 0.0  # until this time no line is written
 
     def _write(self, data: bytes) -> None:
         """Write on stderr; raise BlockingIOError where a pipe or a terminal takes nothing for WAIT_S.
 
-        Nobody reads it, or Ctrl-S stopped it: a command such as disarm would wait for this line."""
+        Nobody reads it, or Ctrl-S stopped it: a command such as disarm would wait for this line. A disk that
+        hangs holds up one line every PAUSE_S."""
+        if (start_s := time.monotonic()) < self.again_s:
+            raise BlockingIOError
         wait_s = 0.0 if self.lost else WAIT_S
         for at in range(0, len(data), select.PIPE_BUF):
             if not select.select([], [2], [], wait_s)[1]:
@@ -105,6 +111,8 @@ class _Stderr:
             part = data[at : at + select.PIPE_BUF]
             done = os.write(2, part)
             self.torn = at + done < len(data)
+        if (end_s := time.monotonic()) - start_s > SLOW_S:
+            self.again_s = end_s + PAUSE_S
 
     def info(self, line: str) -> None:
         """Write one line."""
