@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import loads
+from thermoctl.plant.native.build import run_compiler
 from thermoctl.plant.simulation.simulate import compile_plant
 from thermoctl.recording.table import Table
 
@@ -47,3 +49,10 @@ def test_where_no_cache_can_be_written_a_plant_is_compiled_for_this_process(
     monkeypatch.setenv("THERMOCTL_CACHE", str(tmp_path / "file" / "cache"))
     assert np.array_equal(heated(RATES[2]), expected)
     assert (tmp_path / "file").read_text() == ""
+
+
+def test_a_compiler_that_fails_gives_one_line_and_needs_no_room_elsewhere(tmp_path: Path):
+    """gcc wrote its own files to /tmp: where that was full, nothing could be simulated."""
+    fails = 'echo "in file a.c:" >&2; echo "error: no room in $TMPDIR" >&2; echo "  5 | x" >&2; exit 1'
+    with pytest.raises(InputError, match=f"failed on the plant: error: no room in {tmp_path}$"):
+        run_compiler(["sh", "-c", fails], "the plant", str(tmp_path))

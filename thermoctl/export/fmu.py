@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import uuid
@@ -19,10 +18,9 @@ from thermoctl import __version__
 from thermoctl.export.c import core, time_jumps
 from thermoctl.export.values import Values, first_outputs
 from thermoctl.files.safe_file import whole_file
-from thermoctl.files.yamlfile import InputError
 from thermoctl.plant import expression as ex
 from thermoctl.plant.language import Plant
-from thermoctl.plant.native.build import compiler
+from thermoctl.plant.native.build import compiler, run_compiler
 from thermoctl.plant.simulation.equations import Equations
 from thermoctl.units import conversion, dimension
 
@@ -46,11 +44,7 @@ def write_fmu(plant: Plant, numbers: Values, path: Path, start: dict[str, float]
         code, library = Path(work) / f"{identifier}.c", Path(work) / f"{identifier}{suffix}"
         code.write_text(source)
         command = [*compiler(), "-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-w"]
-        done = subprocess.run(
-            [*command, "-o", str(library), str(code), "-lm"], capture_output=True, text=True
-        )
-        if done.returncode:
-            raise InputError(f"the C compiler failed on the FMU: {done.stderr.strip()[:500]}")
+        run_compiler([*command, "-o", str(library), str(code), "-lm"], "the FMU", work)
         packed = Path(work) / "packed.fmu"
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as fmu:
             fmu.writestr("modelDescription.xml", _description(plant, e, numbers, identifier, guid, begin))

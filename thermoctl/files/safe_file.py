@@ -36,6 +36,7 @@ _REMEDIES = {
     errno.EEXIST: _IN_THE_WAY,
     errno.EISDIR: "a folder has this name: give another path",
     errno.ENOENT: "make the folder first, or give another path",
+    errno.EFBIG: "`ulimit -f` or the file system allows no larger file: give another path",
     errno.ENAMETOOLONG: "give a shorter path",
 }
 

@@ -53,6 +53,15 @@ def compiler() -> list[str]:
     return command[: command.index("-O1")]
 
 
+def run_compiler(command: Sequence[str], what: str, work: str) -> None:
+    """Run the C compiler with its own temporary files in `work`. Raises InputError with its first error."""
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "TMPDIR": work})
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        first = next((line for line in said if "error" in line), said[0] if said else "it says nothing")
+        raise InputError(f"the C compiler failed on {what}: {first.strip()[:500]}")
+
+
 def cache_directory() -> Path:
     """Return the folder of compiled plants: $THERMOCTL_CACHE, else thermoctl/plants in the user's cache."""
     own = os.environ.get("THERMOCTL_CACHE")
@@ -111,9 +120,7 @@ def _build(path: Path, source: str, folders: Sequence[Path], objects: Sequence[P
         text.write_text(source)
         kind = ["-shared", *map(str, objects), "-lm"] if path.suffix == ".so" else ["-c"]
         command = [*_compiler()[0], *(f"-I{f}" for f in folders), "-o", str(made), str(text), *kind]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise InputError(f"the C compiler failed on the plant: {done.stderr.strip()[:500]}")
+        run_compiler(command, "the plant", work)
         move(made, path)
 
 
@@ -130,4 +137,4 @@ def _trim(folder: Path, keep: int = 2000, age_s: float = 86_400.0) -> None:
             path.unlink(missing_ok=True)
 
 
-__all__ = ["cache_directory", "compiler", "library"]
+__all__ = ["cache_directory", "compiler", "library", "run_compiler"]
