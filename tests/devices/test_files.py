@@ -201,6 +201,23 @@ def test_a_sentinel_that_cannot_come_is_refused(tmp_path, sentinel):
         device(tmp_path, START + GOOD, [f"{V}, sentinels: [{sentinel}]"], "{v: voltage_v}")
 
 
+@pytest.mark.parametrize("sign", ["1-", "0-"])
+@pytest.mark.parametrize("stated", [0, 2, 5])
+def test_a_signal_beyond_the_length_of_its_message_costs_no_other(tmp_path, stated, sign):
+    """With a length below 6 the message did not decode at all, though `check` found nothing."""
+    beyond = f' SG_ X : {40 if sign == "1-" else 47}|8@{sign} (1,0) [0|0] "A" HOST\n'
+    message = GOOD.replace("READING: 8", f"READING: {stated}").replace(" SG_ T", beyond + " SG_ T")
+    dev = device(
+        tmp_path,
+        START + message,
+        [V, T, V.replace("v:", "x:").replace("Volts", "X").replace("unit: V", "unit: A")],
+        "{v: voltage_v, t: air_c, x: current_a}",
+    )
+    sample = read(dev, (801, bytes.fromhex("d2043c0000fb")))
+    found = [sample.value[ROLE[r]] for r in ("voltage_v", "air_c", "current_a")]
+    assert found == pytest.approx([12.34, 20.0, -5.0])
+
+
 @pytest.mark.parametrize("size", [3, 4, 7])
 def test_a_short_frame_gives_the_signals_that_it_has(tmp_path, size):
     dev = device(tmp_path, START + GOOD, [V, T])

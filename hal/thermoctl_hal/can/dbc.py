@@ -199,6 +199,7 @@ def _decoded(message: DbcMessage, data: bytes, wanted: Iterable[str]) -> Mapping
 
     cantools selects a page by the number that it returns for the multiplexer, and pages are counted in raw
     numbers. Of a page that the file does not describe, those of every page and the wanted ones."""
+    message = _long_enough(message)
     try:
         found: Any = message.decode_simple(data, False, False, True)
     except Exception:  # foreign bytes may raise anything in the library
@@ -209,6 +210,19 @@ def _decoded(message: DbcMessage, data: bytes, wanted: Iterable[str]) -> Mapping
             with suppress(Exception):  # it is on another page
                 found |= _alone(message, name).decode_simple(data, False, False, True)
     return cast(Mapping[str, float], found)
+
+
+@lru_cache(maxsize=256)
+def _long_enough(message: DbcMessage) -> DbcMessage:
+    """Return a message as long as its signals: with a shorter length cantools decodes none of them."""
+    ends = (
+        s.length + (s.start if s.byte_order == "little_endian" else s.start // 8 * 8 + 7 - s.start % 8)
+        for s in message.signals
+    )
+    needed = -(-max(ends, default=0) // 8)
+    if needed <= message.length:
+        return message
+    return type(message)(message.frame_id, message.name, needed, message.signals, strict=False)
 
 
 @lru_cache(maxsize=256)
