@@ -329,6 +329,11 @@ CASES = (
          + rows("", "temp,177235920{i}000000000,b,{P}"), {"a": RISING, "b": POWER}),
     Case("Windows performance monitor", "perfmon.csv", rows('"(PDH-CSV 4.0) (UTC)(0)","\\\\PC\\Fan","\\\\PC\\Load"\n', '"03/14/2026 10:00:{s}.123","{T}"," "'),
          {"\\\\PC\\Fan": RISING}),
+    Case("PX4, ulog2csv", "sensor_baro_0.csv", rows("timestamp,timestamp_sample,temperature\n", "{i}020000,{i}019400,{T}.5"),
+         {"temperature": [x + 0.5 for x in RISING]}, [0.02, 1.02, 2.02, 3.02, 4.02, 5.02]),
+    Case("logfmt", "run.log", rows("", "ts=" + DATE + "T10:00:{s}Z level=info T={T} P={P}"), {"T": RISING, "P": POWER}),
+    Case("a program's log of a date and pairs", "pairs.log", rows("", DATE + "T10:00:{s}Z T={T} P={P}"), {"T": RISING, "P": POWER}),
+    Case("a unit behind each value, without a name", "units.csv", rows("Time (s),T,,P,\n", "{i},{T},°C,{P},W"), {"T": RISING, "P": POWER}, units={"T": "degC", "P": "W"}),
     Case("JSON lines", "run.jsonl", rows("", '{{"time": "' + DATE + 'T10:00:{s}Z", "T": {T}, "P": {P}}}'), {"T": RISING, "P": POWER}),
 )  # fmt: skip
 

@@ -21,7 +21,7 @@ import pyarrow.parquet
 from thermoctl.files.safe_file import whole_file
 from thermoctl.files.yamlfile import InputError, suggest
 from thermoctl.recording.stream import CRC, checksums, open_stream, texts
-from thermoctl.recording.table import Table
+from thermoctl.recording.table import Table, exact
 
 MAX_CELLS = 250_000_000  # 2 GB of float64; a longer recording is read a few columns or hours at a time
 MAX_CSV_BYTES = 4_000_000_000
@@ -142,9 +142,9 @@ def checked(path: Path, raw: Raw) -> Table:
     still = np.diff(t) <= 0
     if still.any():
         row = int(still.argmax()) + 1
-        what = "stands twice" if t[row] == t[row - 1] else f"runs backwards from {t[row - 1]:.17g}"
+        what = "stands twice" if t[row] == t[row - 1] else f"runs backwards from {exact(t[row - 1])}"
         raise InputError(
-            f"{raw.place(row)}: the time {t[row]:.17g} {what}; strictly increasing seconds were expected"
+            f"{raw.place(row)}: the time {exact(t[row])} {what}; strictly increasing seconds were expected"
         )
     return Table(path.stem, str(path), t, columns, raw.meta, recorded=True)
 

@@ -29,3 +29,8 @@ class Table:
 
     def __len__(self) -> int:
         return len(self.t)
+
+
+def exact(t: float) -> str:
+    """Return a time with the digits that tell it from every other: 0.464, not 0.46400000000000002."""
+    return np.format_float_positional(t, trim="-")

@@ -34,7 +34,9 @@ _LABELS = re.compile(
     r"(?:(?P<stamp>\d\d:\d\d:\d\d\.\d+) -> )?(?P<labels>(?:[A-Za-z_]\w*[:=]\s?[-+]?[\d.]+(?:[eE][-+]?\d+)?(?:[,\t ]+|$)){2,})",
     re.MULTILINE,
 )
-_STAMP = re.compile(r"^\[?(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?(?:Z|[+-]\d\d:?\d\d)?)(?=[\]\s,])")
+_STAMP = re.compile(
+    r"^\[?(?:(?:ts|time|timestamp)=\"?)?(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?(?:Z|[+-]\d\d:?\d\d)?)(?=[\]\s,\"])"
+)
 # T=20.1 degC of a log's line; the unit is no name of the next pair.
 _PAIR = re.compile(
     r"([^\W\d]\w*)=([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?![\w.:/-])(?: ?([^\s,;=\d][^\s,;=]*)(?![^\s,;]*=))?"
@@ -209,7 +211,13 @@ _LAYOUTS: tuple[tuple[re.Pattern[str], Callable[[Path, str], list[Sheet] | None]
     (re.compile(r"^(?:.*\s)?Stats \d+\.\d+: ", re.MULTILINE), _klipper),
     (re.compile(r"\A\W?\w?Record Length\"?,"), _tektronix),
     (re.compile(r"\A#\s*Probe 0 \("), _probes),
-    (re.compile(rf"{_STAMP.pattern}[^=\n]*(?:INFO|DEBUG|WARN|ERROR)[^=\n]*=[-+\d]", re.MULTILINE), _logged),
+    (
+        re.compile(
+            rf"{_STAMP.pattern}(?:.*(?:INFO|DEBUG|WARN|ERROR|level=)[^=\n]*|\"? [^\W\d]\w*)=[-+\d]",
+            re.MULTILINE,
+        ),
+        _logged,
+    ),
     (re.compile(rf"\A{_LABELS.pattern}\s*$", re.MULTILINE), _labelled),
 )
 

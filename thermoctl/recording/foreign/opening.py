@@ -325,6 +325,8 @@ def _stated(sheet: Sheet, dialect: Dialect) -> list[Sheet]:
     sheet.units = dict(dialect.units)
     if set(dialect.names) >= _ARTISAN:
         sheet.units["Time1"] = "mm:ss"
+    if list(dialect.names[:2]) == ["timestamp", "timestamp_sample"]:  # ulog2csv of PX4
+        sheet.units |= dict.fromkeys(dialect.names[:2], "us")
     sheet.columns = {n: c for n, c in sheet.columns.items() if not FACT.match(n)}
     sheet.decimal = dialect.decimal or ("," if dialect.separator == ";" else None)
     if (stated := stated_step(dialect.facts)) is not None:

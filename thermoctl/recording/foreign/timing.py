@@ -19,7 +19,7 @@ from thermoctl.recording.foreign.cells import CellError
 from thermoctl.recording.foreign.clock import ClockError, Seconds
 from thermoctl.recording.foreign.sheet import How, Sheet
 from thermoctl.recording.foreign.units import column_of, interval, known, named, states_unit_of, tokens
-from thermoctl.recording.table import Table
+from thermoctl.recording.table import Table, exact
 
 _ADVICE = "name it with --time COLUMN, or say the time from row to row, such as --time 0.1s"
 MIXED = "times in UTC beside times of a zone that is not stated; write all of them in UTC"
@@ -116,7 +116,7 @@ def _take_units(sheet: Sheet, valued: Sheet) -> None:
     for k, name in enumerate(names):
         near = [
             n for n in (*names[:k][-1:], *names[k + 1 : k + 2]) if states_unit_of(_plain(name), _plain(n))
-        ]
+        ] or ([] if _plain(name) else names[:k][-1:])
         before = next((n for n in near if _is_numbers(valued.columns.get(n))), None)
         if name not in valued.left or before is None or {*names[:k][-1:]} & valued.left.keys():
             continue
@@ -124,10 +124,10 @@ def _take_units(sheet: Sheet, valued: Sheet) -> None:
         texts = pc.utf8_trim_whitespace(pc.fill_null(sheet.columns[name], ""))
         texts = pc.replace_substring_regex(texts, r"\s*(?:AC|DC)\s*", "")
         words = [w for w in pc.unique(texts).to_pylist() if w]
-        if all(map(known, words)):
+        if all(map(known, words)) and (_plain(name) or len(words) == 1):
             del valued.left[name]
             _put(valued, before, cells.with_units(_plain(before), values, texts, ~np.isfinite(values), ()))
-        elif len(words) > 1:
+        elif len(words) > 1 and _plain(name):
             row = pc.index(texts, words[1]).as_py()
             raise CellError(
                 row,
@@ -386,7 +386,7 @@ def _one_run(sheet: Sheet, t: np.ndarray, rows: np.ndarray, how: How, notes: lis
         " by an hour (daylight saving?)" if abs(jump + usual - clock.HOUR_S) <= max(1.5 * usual, 1.0) else ""
     )
     raise InputError(
-        f"{sheet.place(row)}: the time {t[row]:.17g} runs backwards from {t[before]:.17g}{hour}: {len(parts)} runs in one "
+        f"{sheet.place(row)}: the time {exact(t[row])} runs backwards from {exact(t[before])}{hour}: {len(parts)} runs in one "
         f"file? --run 1 reads the first, up to --run {len(parts)}"
     )
 
@@ -400,7 +400,7 @@ def _distinct(
     if how.equal_times is None:
         row = int(np.flatnonzero(np.diff(t) == 0)[0]) + 1
         raise InputError(
-            f"{sheet.place(int(rows[row]))}: the time {t[row]:.17g} stands twice; strictly increasing seconds were expected "
+            f"{sheet.place(int(rows[row]))}: the time {exact(t[row])} stands twice; strictly increasing seconds were expected "
             "(--equal-times spread: rows of one time at even steps to the next; mean, first or last: one row of them)"
         )
     notes.append(f"{int((counts - 1).sum())} rows of equal times: {how.equal_times}")
