@@ -119,7 +119,7 @@ def test_the_prior_of_a_limit_depends_on_what_the_signal_visits_and_not_on_the_z
     )
     runs = [model.run(drive)]
     spans = {
-        ranges_of(Direction(found, shape, 1.0, 1, {"YLIM": shape["level"]}))["YLIM"]
+        ranges_of(Direction(found, shape, 1.0, 1, {"YMAX": shape["level"]}))["YMAX"]
         for shape in shape_grid("end_levels", found, runs)
     }
     y = runs[0].y[:, 0] - zero
@@ -149,7 +149,7 @@ def test_an_offset_step_is_no_larger_than_the_largest_jump_of_its_reading(motor,
 
 @pytest.mark.parametrize(
     ("electronics", "values"),
-    [("sensor_offset_step", {"A": 3.0, "T0": 1000.0}), ("sensor_saturation", {"YLIM": 24.0})],
+    [("sensor_offset_step", {"A": 3.0, "T0": 1000.0}), ("sensor_saturation", {"YMAX": 24.0})],
 )
 @pytest.mark.parametrize("slow", ["sensor_lag", "expansion_lag"])
 def test_a_slow_part_of_a_reading_comes_before_its_electronics_in_whichever_order_it_is_found(

@@ -149,7 +149,7 @@ def _values(c: Candidate) -> dict[str, float]:
         "N": 0.4,
         "E": 1.0e-9,
         "P": 0.01,
-        "YLIM": 25.0,
+        "YMAX": 25.0,
     }
     special |= {f"B{k}": 22.0 + k for k in range(5)}
     return {p.name: special.get(p.name, 0.02 + p.null) for p in c.effect.parameters}
@@ -170,7 +170,7 @@ def _changes(rig: Given) -> dict[tuple, tuple[dict, dict]]:
         if not c.place.input:  # an input's fault is in the input's own unit
             values = _values(c)
             if rig.plant["outputs"].get(c.place.where, {}).get("unit") == "K":
-                values = {k: v + 273.15 * (k == "YLIM") for k, v in values.items()}  # a level of that reading
+                values = {k: v + 273.15 * (k == "YMAX") for k, v in values.items()}  # a level of that reading
             own = {c.own(k): v for k, v in values.items()}
             out[c.key, c.variant, c.label] = Overlay(plant, c.extend(values)).changes(own, at)
     return out
