@@ -23,6 +23,7 @@ from thermoctl.plant.language import Plant
 from thermoctl.plant.simulation.simulate import Excitation
 
 SHORTEST = 0.1  # shortest lag of a reading of held inputs, in sampling intervals
+LATE = 0.75  # the same of an input: half a row is what late rows come to on average
 # Smooth dry friction creeps. A refit may make this creep slower than the screening's by this factor: an axis
 # that sticks rests for a long time.
 STICKING = 300.0
@@ -91,10 +92,12 @@ def _range(direction: Direction, p: EffectParameter) -> tuple[float, float] | No
         return 0.75 * value, max(value, min(1.33 * value, direction.shape.get("longest", np.inf)))
     if p.shape == "level":  # the prior must not follow where the screening stood
         return max(p.low, direction.shape["least"]), direction.shape["most"]
+    straight = any("straight" in change for change in c.effect.changes[c.variant])
+    # a shorter lag only draws a held input straight, or moves an input whose rows are up to one late
+    shortest = c.rig.sample * (LATE if c.place.input else SHORTEST if straight else 0.0)
     if kind == "delays":
-        return 0.0, max(value * 8, 0.05 * duration)
-    if any("straight" in change for change in c.effect.changes[c.variant]):
-        shortest = SHORTEST * c.rig.sample  # a shorter lag only draws a held input straight
+        return shortest, max(max(shortest, value) * 8, 0.05 * duration)
+    if kind == "lags" and shortest:
         return max(shortest, value / 30), max(shortest, value) * 30
     if p.shape:
         least = STICKING if kind == "creep_speeds" else 30
