@@ -108,8 +108,9 @@ FRICTION = '  dry: {from: v, rate: "0.02 * sign(v)", unit: N}'
 
 
 def test_a_small_effect_in_coloured_noise_is_still_named():
-    plant, tables = recorded("stage", 10, 1.0, 1, FRICTION)
-    found = diagnose(plant, tables, catalogue(), limits())
+    plant, tables = recorded("stage", 10, 1.0, 1, FRICTION, 700)
+    known = {n: catalogue()[n] for n in ("coulomb_friction", "viscous_friction")}
+    found = diagnose(plant, tables, known, limits())
     assert ("coulomb_friction", "v") in found.decision.named
 
 
