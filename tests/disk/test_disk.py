@@ -20,18 +20,8 @@ SAMPLE = ("recorder and", "tune", "rollback", "save-effect")
 @pytest.mark.skipif(not shutil.which("gcc"), reason="needs gcc")
 def test_a_sample_of_writers_under_errors(tmp_path):
     section = tmp_path / "section"
-    command = [
-        sys.executable,
-        "-m",
-        "tests.disk.run",
-        *SAMPLE,
-        "--every",
-        "4",
-        "--on",
-        "tmpfs",
-        "--section",
-        str(section),
-    ]
+    command = [sys.executable, "-m", "tests.disk.run", *SAMPLE]
+    command += ["--every", "7", "--on", "tmpfs", "--section", str(section)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert section.read_text().count("\n| ") == len(SAMPLE) + 2, "a row each, the head and the sum"

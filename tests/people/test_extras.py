@@ -82,22 +82,24 @@ from thermoctl.extras import EXTRAS, lacking
 for packages in EXTRAS.values():
     for module in packages:
         sys.modules[module] = None
-import numpy, scipy.stats, pyarrow, pint, rich.table, yaml, structlog, shtab, crccheck.crc
-functions = {c.function for c in COMMANDS}
-bad = 0
-for extra in ["no extra", *EXTRAS]:
+modules = sorted({c.function.partition(":")[0] for c in COMMANDS})
+def load(extra):
+    bad = 0
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as e:
+            if lacking(e) is None:
+                print(f"{extra}: {module}: {e}", file=sys.stderr)
+                bad = 1
+    return bad
+bad = load("no extra")  # what loads without any is loaded once, for all
+for extra in EXTRAS:
     child = os.fork()
     if not child:
-        for module in EXTRAS.get(extra, ()):
+        for module in EXTRAS[extra]:
             del sys.modules[module]
-        for module in sorted(f.partition(":")[0] for f in functions):
-            try:
-                importlib.import_module(module)
-            except ModuleNotFoundError as e:
-                if lacking(e) is None:
-                    print(f"{extra}: {module}: {e}", file=sys.stderr)
-                    bad = 1
-        os._exit(bad)
+        os._exit(load(extra))
     bad |= os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 sys.exit(bad)
 """
