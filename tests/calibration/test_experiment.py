@@ -63,24 +63,12 @@ def test_from_experiment_to_a_model_in_the_daemon_and_back(quick, capsys):
         and np.ptp(table.columns["output_reference_um"] - table.columns["position_raw_um"]) > 0.5
     )
 
-    identify = [
-        "identify",
-        "test_2.parquet",
-        "test_3.parquet",
-        "test_4a.parquet",
-        "--config",
-        "rig.yaml",
-        "--order",
-        "2",
-    ]
+    tests = ["test_2.parquet", "test_3.parquet", "test_4a.parquet"]
+    identify = ["identify", *tests, "--config", "rig.yaml", "--order", "2"]
     assert cli.main(identify) == 0
     one = modelfile.current("models")
     found = modelfile.load_calibration(one)
-    assert found.rig == "simulated" and set(found.fingerprints) == {
-        "test_2.parquet",
-        "test_3.parquet",
-        "test_4a.parquet",
-    }
+    assert found.rig == "simulated" and set(found.fingerprints) == {*tests}
     assert found.figures["expansion_rms_um"] < 0.5
 
     # The daemon's own loader takes it by the folder, and refuses it for a rig of another name.

@@ -126,7 +126,7 @@ DIALECTS = {
         b"\x09\x00\xff\x00" + struct.pack(">h", 258) + struct.pack("<h", 3),
         258,
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DIALECTS)
@@ -225,24 +225,9 @@ LINES = {
     "hexadecimal": (text("(?P<x>[-+][0-9A-F]+)$", channel=", base: 16"), b"+1E5\r\n", 485, b"+1G5\r\n"),
     "decimal comma": (text("(?P<x>[-+0-9,]+)$", "  decimal: ','\n"), b"-1,5\r\n", -1.5, b"-1.5\r\n"),
     "blanks between sign and digits": (text("(?P<x>[-+] *[0-9.]+)$"), b"-   5.23\r\n", -5.23, b"-   -5.23\n"),
-    "sign behind the digits": (
-        text("(?P<x>[0-9.]+)(?P<s>[-+])$", channel=", sign: s"),
-        b"5.23-\n",
-        -5.23,
-        b"5.23 \n",
-    ),
-    "lines that end with ETX": (
-        text("\\x02(?P<x>[-+0-9.]+)$", "  end: '\\x03'\n"),
-        b"\x02+7.5\x03",
-        7.5,
-        b"7.5\x03",
-    ),
-    "NMEA checksum": (
-        text("\\$PGAUGE,(?P<x>[-+0-9.]+),um", "  checksum: {crc: xor8}\n"),
-        nmea(12.25),
-        12.25,
-        nmea(12.25, 1),
-    ),
+    "sign behind the digits": (text("(?P<x>[0-9.]+)(?P<s>[-+])$", channel=", sign: s"), b"5.23-\n", -5.23, b"5.23 \n"),
+    "lines that end with ETX": (text("\\x02(?P<x>[-+0-9.]+)$", "  end: '\\x03'\n"), b"\x02+7.5\x03", 7.5, b"7.5\x03"),
+    "NMEA checksum": (text("\\$PGAUGE,(?P<x>[-+0-9.]+),um", "  checksum: {crc: xor8}\n"), nmea(12.25), 12.25, nmea(12.25, 1)),
     "checksum of another maker": (
         text("(?P<x>[-+0-9.]+):", "  checksum: {crc: sum8, pattern: '(?P<data>.*):(?P<sum>..)$'}\n"),
         b"1.5:%02X\r" % (sum(b"1.5") & 255),
@@ -258,7 +243,7 @@ LINES = {
         b"0.5 ft\r\n",
     ),
     "exponent": (text("X(?P<x>[-+0-9.E]+)$"), b"X+1.25E+2\r\n", 125, b"X+1.25E+\r\n"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LINES)

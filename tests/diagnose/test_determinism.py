@@ -21,23 +21,10 @@ def test_two_runs_at_once_on_one_and_on_two_threads_write_the_same_bytes(tmp_pat
     plant = str(tmp_path / "case" / "plant.yaml")
     outs, started = [tmp_path / "1", tmp_path / "2"], []
     for n, out in enumerate(outs, 1):
-        env = os.environ | {
-            "OPENBLAS_NUM_THREADS": str(n),
-            "OMP_NUM_THREADS": str(n),
-            "PYTHONHASHSEED": str(n),
-        }
-        command = [
-            sys.executable,
-            "-m",
-            "thermoctl.cli",
-            "diagnose",
-            "--quiet",
-            "--plant",
-            plant,
-            "--out",
-            str(out),
-            *files,
-        ]
+        names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "PYTHONHASHSEED")
+        env = os.environ | dict.fromkeys(names, str(n))
+        words = f"-m thermoctl.cli diagnose --quiet --plant {plant} --out {out}".split()
+        command = [sys.executable, *words, *files]
         started.append(subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL))
     assert [p.wait(timeout=300) for p in started] == [0, 0]
     assert set(written(outs[0])) == {"diagnosis.json", "memory.json", "plant.yaml", "report.html"}

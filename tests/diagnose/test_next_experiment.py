@@ -281,17 +281,8 @@ def test_two_explanations_that_look_alike_are_decided_by_the_proposed_experiment
     (tmp_path / "plant.yaml").write_text(HEATED_BLOCK)
     (tmp_path / "truth.yaml").write_text(TRUTH)
     write_table(tmp_path / "run_1.csv", compile_plant(loads(TRUTH), ()).measure(short_pulses(), seed=1))
-    common = [
-        "diagnose",
-        "--plant",
-        str(tmp_path / "plant.yaml"),
-        str(tmp_path / "run_1.csv"),
-        "--out",
-        str(tmp_path / "out"),
-        "--limit",
-        "T_block=15:110",
-        "--json",
-    ]
+    plant, run, out = (str(tmp_path / n) for n in ("plant.yaml", "run_1.csv", "out"))
+    common = ["diagnose", "--plant", plant, run, "--out", out, "--limit", "T_block=15:110", "--json"]
     assert main([*common, "--quiet"]) == 0
     alone = json.loads(capsys.readouterr().out)
     names = {f["effect"] for f in alone["findings"]} | {a["effect"] for a in alone["alternatives"]}

@@ -94,13 +94,7 @@ def switched_off(rig):
 CAUSES = [
     # what is broken, which rig, how, what the first line has to say, and what the lines of the devices do
     ("coil thermocouple open", HazardRig, injected("error", "coil_c"), "coil_error", "coil_c"),
-    (
-        "thermocouple module unplugged",
-        HazardRig,
-        injected("error", *TEMPERATURES, "air_c"),
-        "coil_error",
-        "bracket_2_c",
-    ),
+    ("thermocouple module unplugged", HazardRig, injected("error", *TEMPERATURES, "air_c"), "coil_error", "bracket_2_c"),
     ("coil thermocouple silent", HazardRig, injected("drop", "coil_c"), "coil_stale", "coil_c"),
     ("coil thermocouple jumps", HazardRig, injected("step", "coil_c", by=30.0), "coil_rate", "jumped"),
     ("coil reading not a number", HazardRig, injected("nan", "coil_c"), "coil_range", "coil_c"),
@@ -109,32 +103,14 @@ CAUSES = [
     ("voltage meter unplugged", HazardRig, injected("error", "voltage_v"), "voltage_error", "voltage_v"),
     ("voltage meter hangs", HazardRig, injected("freeze", "voltage_v"), "voltage_frozen", "without a change"),
     ("current sensor unplugged", HazardRig, injected("error", "current_a"), "current_error", "current_a"),
-    (
-        "current sensor hangs",
-        HazardRig,
-        injected("freeze", "current_a"),
-        "current_frozen",
-        "without a change",
-    ),
-    (
-        "voltage meter reads 2 V too much",
-        HazardRig,
-        injected("step", "voltage_v", by=2.0),
-        "electrical_disagrees",
-        "",
-    ),
+    ("current sensor hangs", HazardRig, injected("freeze", "current_a"), "current_frozen", "without a change"),
+    ("voltage meter reads 2 V too much", HazardRig, injected("step", "voltage_v", by=2.0), "electrical_disagrees", ""),
     ("encoder hangs", WiredRig, hangs, "position_frozen", "without a change"),
     ("encoder jumps by 60 um", WiredRig, encoder_counts(lambda n: n + 12000), "position_rate", "jumped"),
     ("encoder reads 900 um", WiredRig, encoder_counts(lambda n: 180000), "position_range", "900"),
     ("machine late by 40 ms", HazardRig, late(0.040), "late by 40 ms", "position_um"),
     ("drive's stop input closed", WiredRig, switched_off, "amplifier_stopped", ""),
-    (
-        "amplifier drives 0.3 A, whatever it is told",
-        HazardRig,
-        injected("stuck", by=0.3),
-        "following_error",
-        "",
-    ),
+    ("amplifier drives 0.3 A, whatever it is told", HazardRig, injected("stuck", by=0.3), "following_error", ""),
     ("encoder's cable pulled", WiredRig, unplug("encoder"), "position_stale", "reconnecting"),
     ("encoder's checksums wrong", WiredRig, spoil, "position_", "position_um"),
     ("encoder mute", WiredRig, silent, "position_stale", "no new"),
@@ -144,7 +120,7 @@ CAUSES = [
     ("drive: over-current", WiredRig, code(0x2310), "0x2310 (continuous over-current", ""),
     ("drive: own following error", WiredRig, code(0x8611), "0x8611 (following error in the drive", ""),
     ("CAN bus-off", "socketcan", bus_off, "amplifier_error", "bus-off"),
-]
+]  # fmt: skip
 
 
 LOSSES = {

@@ -54,17 +54,6 @@ def test_a_foreign_recording_is_held_against_the_plant_as_a_csv_is(suffix, tmp_p
     # and it is refused as a CSV is
     spoilt = {n: v for n, v in csv.columns.items() if n != "heat"}
     write(tmp_path / f"spoilt{suffix}", csv.t, spoilt)
-    assert (
-        main(
-            [
-                "diagnose",
-                "--plant",
-                str(EXAMPLE / "plant.yaml"),
-                str(tmp_path / f"spoilt{suffix}"),
-                "--out",
-                str(tmp_path / "out"),
-            ]
-        )
-        == 2
-    )
+    files = [str(EXAMPLE / "plant.yaml"), str(tmp_path / f"spoilt{suffix}"), "--out", str(tmp_path / "out")]
+    assert main(["diagnose", "--plant", *files]) == 2
     assert "no column 'heat'" in capsys.readouterr().err and not (tmp_path / "out").exists()

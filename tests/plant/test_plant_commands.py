@@ -140,29 +140,12 @@ def block(tmp_path):
 
 def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
     both = [str(block / "a.csv"), str(block / "b.csv")]
-    assert (
-        main(
-            f"simulate --plant {block / 'p.yaml'} {' '.join(both)} --out {block / 'o.csv'} --plot {block / 'o.png'}".split()
-        )
-        == 0
-    )
+    files = f"{' '.join(both)} --out {block / 'o.csv'} --plot {block / 'o.png'}"
+    assert main(f"simulate --plant {block / 'p.yaml'} {files}".split()) == 0
     free = read_table(block / "o_a.csv").columns
     assert (block / "o_b.png").stat().st_size > 10_000
-    assert (
-        main(
-            [
-                "simulate",
-                "--plant",
-                str(block / "p.yaml"),
-                both[0],
-                "--horizon",
-                "10",
-                "--out",
-                str(block / "h.csv"),
-            ]
-        )
-        == 0
-    )
+    words = f"simulate --plant {block / 'p.yaml'} {both[0]} --horizon 10 --out {block / 'h.csv'}"
+    assert main(words.split()) == 0
     ahead = read_table(block / "h.csv").columns
     errors = [np.sqrt(np.mean((c["y"] - c["y_simulated"]) ** 2)) for c in (free, ahead)]
     assert errors[1] < 0.3 * errors[0]  # the wrong belief has ten seconds only to go astray
@@ -171,15 +154,9 @@ def test_simulate_writes_plots_and_predicts_ahead(block, capsys):
 
 @pytest.mark.parametrize("noise", ["white", "ar1"])
 def test_refit_finds_the_truth_and_judges_on_held_out_data(block, capsys, noise):
-    assert (
-        main(
-            (
-                f"refit --plant {block / 'p.yaml'} {block / 'a.csv'} --held-out {block / 'b.csv'} --out {block / 'p2.yaml'} "
-                f"--noise {noise}"
-            ).split()
-        )
-        == 0
-    )
+    p, a, b, p2 = (block / n for n in ("p.yaml", "a.csv", "b.csv", "p2.yaml"))
+    words = f"refit --plant {p} {a} --held-out {b} --out {p2} --noise {noise}"
+    assert main(words.split()) == 0
     found = load(block / "p2.yaml").parameters
     assert found["C"].value == pytest.approx(46, rel=0.03) and found["G"].value == pytest.approx(
         0.31, rel=0.03

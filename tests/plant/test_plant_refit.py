@@ -97,12 +97,8 @@ def test_the_command_says_all_of_it(tmp_path, capsys):
     )
     for name, seed in (("a", 1), ("b", 2)):
         write_table(tmp_path / f"{name}.csv", recorded(TRUTH, name=name, seed=seed))
-    assert (
-        main(
-            f"refit --plant {tmp_path / 'p.yaml'} {tmp_path / 'a.csv'} --held-out {tmp_path / 'b.csv'}".split()
-        )
-        == 0
-    )
+    files = f"{tmp_path / 'p.yaml'} {tmp_path / 'a.csv'} --held-out {tmp_path / 'b.csv'}"
+    assert main(f"refit --plant {files}".split()) == 0
     told = " ".join(capsys.readouterr().out.split())
     for words in ("standard error", "dead", "flat", "trades with", "before", "after"):
         assert words in told, words

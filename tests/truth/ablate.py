@@ -89,22 +89,14 @@ def _fine(case: Any) -> list[bool]:
 
 
 RULES: Mapping[str, Rule] = {
-    "misfit": Rule(
-        "an effect counts only where it stands out of the misfit that stays",
-        {"verdict.misfit.physics": _sure},
-    ),
+    "misfit": Rule("an effect counts only where it stands out of the misfit that stays", {"verdict.misfit.physics": _sure}),
     "dozen": Rule(
         "an effect counts only where it stands out; in its place, a misfit's rows count as a few draws (dozen.py)",
         {"verdict.misfit.physics": _sure},
         weighed=dozen.weighed,
     ),
-    "simpler": Rule(
-        "an entry that contains a simpler one has to stand out against it",
-        {"verdict.misfit._is_simpler": _no},
-    ),
-    "weakest": Rule(
-        "of effects that do not stand out the weakest leaves first", {"diagnose.supported": _first}
-    ),
+    "simpler": Rule("an entry that contains a simpler one has to stand out against it", {"verdict.misfit._is_simpler": _no}),
+    "weakest": Rule("of effects that do not stand out the weakest leaves first", {"diagnose.supported": _first}),
     "clean": Rule("a residual up to 1.25 of its noise is no misfit", limits={"clean": 1.0}),
     "coarse": Rule(
         "a reading that rests on its steps has no certain remainder",
@@ -114,19 +106,10 @@ RULES: Mapping[str, Rule] = {
         "of the two refits of a hypothesis the better one counts",
         {"verdict.misfit.as_refitted": _ours, "verdict.confirm.as_refitted": _ours},
     ),
-    "confirmed": Rule(
-        "a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}
-    ),
-    "event": Rule(
-        "beside a misfit an event needs another recording",
-        {"verdict.confirm.timed": _no, "diagnose.timed": _no},
-    ),
-    "only noise": Rule(
-        "where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}
-    ),
-    "unasked": Rule(
-        "where nothing is asked of other parts, the log evidence counts less", limits={"unasked": 1.0}
-    ),
+    "confirmed": Rule("a name has to predict parts that it was not fitted to", {"diagnose.confirmed": _keeps}),
+    "event": Rule("beside a misfit an event needs another recording", {"verdict.confirm.timed": _no, "diagnose.timed": _no}),
+    "only noise": Rule("where only noise is left, nothing is asked of other parts", {"diagnose.only_noise": _no}),
+    "unasked": Rule("where nothing is asked of other parts, the log evidence counts less", limits={"unasked": 1.0}),
     **{
         f"unasked {d:g}": Rule(
             f"there it is divided by `unasked`; by {d:g} in its place", limits={"unasked": d}
@@ -139,9 +122,7 @@ RULES: Mapping[str, Rule] = {
         "a stated noise may be wrong by two standard deviations of its prior",
         {"evidence.levels.levels": _stated},
     ),
-    "coloured": Rule(
-        "a certain remainder may be the coloured noise of a sensor", {"diagnose.coloured": lambda case, f: []}
-    ),
+    "coloured": Rule("a certain remainder may be the coloured noise of a sensor", {"diagnose.coloured": lambda case, f: []}),
     "unknown flow": Rule(
         "an unknown flow is one more hypothesis where nothing else is certain",
         {"diagnose.flow_missing": lambda *a: Missing()},
@@ -176,9 +157,7 @@ RULES: Mapping[str, Rule] = {
         {"search.beam.swap": _nothing, "search.beam.elsewhere": _none},
         searches=True,
     ),
-    "mistakes": Rule(
-        "wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True
-    ),
+    "mistakes": Rule("wrong numbers of the plant file are rivals", {"search.beam.mistakes": _nothing}, searches=True),
     "undone": Rule(
         "an effect that undoes the lag of an input has the odds `rare` once more",
         {"evidence.odds._undone": _no},
@@ -194,11 +173,7 @@ RULES: Mapping[str, Rule] = {
         {"law.contest._as_known": lambda s: None},
         searches=True,
     ),
-    "observer": Rule(
-        "a rig that drifts is searched with an observer, too",
-        {"search.beam.with_observer": _no},
-        searches=True,
-    ),
+    "observer": Rule("a rig that drifts is searched with an observer, too", {"search.beam.with_observer": _no}, searches=True),
     "near nothing": Rule(
         "an effect of no size is left out where the others fit as well from its values",
         {"search.beam.cleared": _none},
@@ -241,7 +216,7 @@ RULES: Mapping[str, Rule] = {
         searches=True,
     ),
     "laws": Rule("laws compete", {"diagnose.with_laws": lambda s: s}, searches=True),
-}
+}  # fmt: skip
 
 
 def part_of(path: str) -> Any:
