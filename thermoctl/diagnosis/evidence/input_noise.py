@@ -76,8 +76,11 @@ def with_input_noise(
             powers = _powers(of, errors)
             for size in errors.sizes:
                 grids = tuple(_noisier(g, size**2 * p) for g, p in zip(of.grids, powers, strict=True))
+                same = all(now is before for now, before in zip(grids, of.grids, strict=True))
+                if same and not errors.width:
+                    continue
                 other = replace(of, grids=grids, noisy=True)
-                if grids != case.grids and (rise := alone(other) - null.log_evidence) > gain:
+                if (rise := alone(other) - null.log_evidence) > gain:
                     best, taken, gain = other, replace(errors, what=errors.what.format(size)), rise
     except (InputError, *FAILS):
         pass

@@ -345,7 +345,9 @@ def _free_parameters(rig: Rig) -> Iterator[Place]:
     """Yield parameters with a range that recordings share, and that a flow, storage or output reads.
 
     Parts of one recording have the same values."""
-    if len(rig.drives) + rig.earlier < 2 or any(d.x0 is not None for d in rig.drives):
+    names = {d.name for d in rig.drives}
+    in_parts = any(d.x0 is not None for d in rig.drives)
+    if len(names) + rig.earlier < 2 or len(names) < len(rig.drives) or in_parts:
         return
     p = rig.physics
     read = [n.storage for n in p.nodes.values()] + [f.rate for f in p.flows.values()]

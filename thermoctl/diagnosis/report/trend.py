@@ -20,6 +20,7 @@ import numpy as np
 
 from thermoctl.diagnosis.evidence.fit import SIGNIFICANT, Fitted
 from thermoctl.diagnosis.evidence.posterior import Posterior
+from thermoctl.diagnosis.hypothesis.candidates import DIFFERS
 from thermoctl.diagnosis.result import Diagnosis
 from thermoctl.files.kept import reading
 from thermoctl.recording.dates import begun, line
@@ -28,10 +29,12 @@ from thermoctl.recording.dates import begun, line
 def trends(d: Diagnosis, before: Sequence[Mapping[str, Any]] = ()) -> list[dict[str, Any]]:
     """Return `trends` of the result: each effect's size by recording, and its change a month.
 
-    An event that begins with a recording and is no finding would hide a trend: without it, if that was
-    refitted. `before`: the trends of an earlier diagnosis, whose recordings come first."""
+    An event that begins with a recording and is no finding would hide a trend. So would an other value. They
+    are left out, if that was refitted. `before`: the trends of an earlier diagnosis, whose recordings come
+    first."""
+    effects = [e for e in d.best.hypothesis.effects if e.candidate.effect.where != DIFFERS]
     named = {e.key for e in d.shown}
-    lasting = {e.key for e in d.best.hypothesis.effects if e.key in named or not e.candidate.begins}
+    lasting = {e.key for e in effects if e.key in named or not e.candidate.begins}
     f = next((w.fitted for w in d.searched.tried if w.fitted.hypothesis.keys == lasting), d.best)
     case, shown = d.case, [e for e in f.hypothesis.effects if e.key in named]
     posterior = Posterior(case, f.plant, f.hypothesis.effects)

@@ -61,6 +61,9 @@ def screened(case: Case, fitted: Fitted, known: Known | None = None) -> Screened
     added = (now.nodes.keys() | now.flows.keys() | now.parameters.keys()) - (
         own.nodes.keys() | own.flows.keys() | own.parameters.keys()
     )
+    # no part of an effect is a place, but for its size, which may differ between recordings
+    effects = fitted.hypothesis.effects
+    added -= {e.own.get(p.name, "") for e in effects for p in e.candidate.effect.parameters if p.amplitude}
     placed = [
         c
         for c in candidates(rig, case.catalogue)
