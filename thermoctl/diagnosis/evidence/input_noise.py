@@ -17,13 +17,13 @@ from scipy.ndimage import gaussian_filter1d
 from thermoctl.diagnosis.data.case import FAILS, Budget, Case
 from thermoctl.diagnosis.data.coordinates import rows_of_each
 from thermoctl.diagnosis.data.grids import Grid
-from thermoctl.diagnosis.evidence.between import alone
-from thermoctl.diagnosis.evidence.fit import fitted
+from thermoctl.diagnosis.evidence.fit import Fitted, fitted
 from thermoctl.diagnosis.evidence.levels import over_noise
+from thermoctl.diagnosis.evidence.noise import averaged
 from thermoctl.files.yamlfile import InputError
 from thermoctl.recording.table import Table
 
-DRAWS = 16
+DRAWS = 8
 # x_k - (x_(k-1) + x_(k+1)) / 2 of white noise: its variance, and its correlation with the next one
 SPREAD, NEXT = 1.5, -2 / 3
 WHITE = 0.1  # largest difference of that correlation from NEXT; a course that is not smooth is no noise
@@ -70,18 +70,17 @@ def with_input_noise(
     recordings."""
     best, taken, gain = case, None, CLEARLY
     try:
-        null = fitted(replace(case, budget=Budget(1)), case.plant, (), case.null)
+        null = _alone(case)
         for errors in _kinds(case, max(over_noise(case, null))):
             of = made(errors.smoothed(case.tables)) if errors.width else case
+            found = _alone(of) if errors.width else null
             powers = _powers(of, errors)
             for size in errors.sizes:
                 grids = tuple(_noisier(g, size**2 * p) for g, p in zip(of.grids, powers, strict=True))
-                same = all(now is before for now, before in zip(grids, of.grids, strict=True))
-                if same and not errors.width:
-                    continue
-                other = replace(of, grids=grids, noisy=True)
-                if (rise := alone(other) - null.log_evidence) > gain:
-                    best, taken, gain = other, replace(errors, what=errors.what.format(size)), rise
+                noisier = averaged(grids, found.powers).log_likelihood - found.log_likelihood
+                if (rise := found.log_evidence + noisier - null.log_evidence) > gain:
+                    best, gain = replace(of, grids=grids, noisy=True), rise
+                    taken = replace(errors, what=errors.what.format(size))
     except (InputError, *FAILS):
         pass
     if taken is None:
@@ -89,6 +88,11 @@ def with_input_noise(
     smooth = f", smoothed over {taken.width:g} rows," if taken.width else ""
     note = f"{taken.what}{smooth} may move the outputs: the plant alone is likelier so ({gain:.0f} nats); counted as noise"
     return replace(best, notes=[*case.notes, note]), taken.smoothed(reserve)
+
+
+def _alone(case: Case) -> Fitted:
+    """Return the refit of a case's plant without effects. Raises SimulationError."""
+    return fitted(replace(case, budget=Budget(1)), case.plant, (), case.null)
 
 
 def _kinds(case: Case, over: float) -> Iterator[Errors]:
@@ -133,22 +137,20 @@ def smooth(x: np.ndarray, width: float) -> np.ndarray:
 
 def _powers(case: Case, errors: Errors) -> list[np.ndarray]:
     """Return the mean power (nodes,) of each output's response. Raises SimulationError."""
-    model, fit, rng = case.null.model, case.null, np.random.default_rng(0)
-    powers = [np.zeros(len(c.count)) for c in case.coordinates.channels]
-    for _ in range(DRAWS):
-        each = iter(powers)
-        for r, (t, d) in enumerate(zip(case.tables, case.drives(model), strict=True)):
+    model, fit, rng, powers = case.null.model, case.null, np.random.default_rng(0), []
+    for r, (t, d) in enumerate(zip(case.tables, case.drives(model), strict=True)):
+        point, channels = (fit.values[r], fit.dx0[r]), case.coordinates.of_recording(r)
+        without, own = model.run(d, *point).y, [np.zeros(len(c.count)) for c in channels]
+        for _ in range(DRAWS):
             noise = {c: sd[r] * rng.standard_normal(len(t)) for c, sd in errors.sd.items()}
             if errors.width:
                 noise = {c: smooth(x, errors.width) for c, x in noise.items()}
             noisy = {c: t.columns[c] + x for c, x in noise.items()}
             moved = replace(model.excitation(replace(t, columns={**t.columns, **noisy})), rtol=d.rtol)
-            point = fit.values[r], fit.dx0[r]
-            response = model.run(moved, *point).y - model.run(d, *point).y
-            channels = case.coordinates.of_recording(r)
-            for c, row in zip(channels, rows_of_each(channels, response), strict=True):
-                power = next(each)
+            rows = rows_of_each(channels, model.run(moved, *point).y - without)
+            for c, row, power in zip(channels, rows, own, strict=True):
                 power += np.bincount(c.band, row**2, len(power)) / DRAWS
+        powers += own
     return [g.power(powers) for g in case.grids]
 
 
